@@ -1,0 +1,23 @@
+"""BOP datasets and result files: read and written, metres inside, millimetres in the files."""
+
+from posecore.bop.dataset import BopDataset, GroundTruth, Target
+from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
+from posecore.bop.results import Estimate, read_results, read_sidecar, sidecar_path, write_results
+from posecore.bop.writer import BopWriter, write_models, write_targets
+
+__all__ = [
+    "BopDataset",
+    "BopWriter",
+    "Estimate",
+    "GroundTruth",
+    "ModelInfo",
+    "Target",
+    "load_models_info",
+    "read_results",
+    "read_sidecar",
+    "sidecar_path",
+    "symmetry_transforms",
+    "write_models",
+    "write_results",
+    "write_targets",
+]

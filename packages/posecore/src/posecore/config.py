@@ -1,0 +1,158 @@
+"""Frozen dataclasses from YAML: nested, every key and type checked, unknown keys rejected by name."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from posecore.errors import ConfigError
+
+T = TypeVar("T")
+
+
+def load_yaml(path: str | Path) -> dict[str, Any]:
+    """Read a YAML mapping.
+
+    Raises:
+        ConfigError: Missing file, invalid YAML (with its line), or not a mapping.
+    """
+    file = Path(path)
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read ({error.strerror}); give the path of a YAML file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not UTF-8 text"
+        raise ConfigError(f"{file}{where}: invalid YAML ({problem})") from error
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ConfigError(f"{file}: found a {type(content).__name__}, expected a mapping of keys")
+    return content
+
+
+def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """Return a copy with `a.b=value` assignments applied; values are read as YAML.
+
+    Raises:
+        ConfigError: An assignment without `=` or through something that is not a group of keys.
+    """
+    result = _copy(mapping)
+    for assignment in overrides:
+        key, equals, text = assignment.partition("=")
+        if not equals or not key:
+            raise ConfigError(f"--set {assignment}: expected key=value, for example --set patch_px=128")
+        try:
+            value = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {assignment}: the value is not valid YAML") from error
+        *groups, leaf = key.split(".")
+        target = result
+        for group in groups:
+            target = target.setdefault(group, {})
+            if not isinstance(target, dict):
+                raise ConfigError(f"--set {assignment}: {group} is a value, not a group of keys")
+        target[leaf] = value
+    return result
+
+
+def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `base` with `top` laid over it, group by group."""
+    result = _copy(base)
+    for key, value in top.items():
+        below = result.get(key)
+        result[key] = merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
+    return result
+
+
+def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+    """Make a frozen dataclass from a mapping; keys that are left out keep their defaults.
+
+    Args:
+        cls: The dataclass; its fields may be dataclasses, tuples, optionals, literals and plain values.
+        mapping: Values by field name.
+        where: File or option, for messages.
+
+    Raises:
+        ConfigError: Unknown key, missing key, value of another type, or one that the class refuses.
+    """
+    return typing.cast(T, _build(cls, mapping, where, ""))
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """The plain mapping (lists, numbers, strings) that `build` makes this dataclass of."""
+    return typing.cast(dict[str, Any], _plain(config))
+
+
+def dump_yaml(config: Any) -> str:
+    """The resolved configuration as YAML, in field order."""
+    return yaml.safe_dump(to_dict(config), sort_keys=False, allow_unicode=True)
+
+
+def _build(cls: type, mapping: Any, where: str, prefix: str) -> Any:
+    if not isinstance(mapping, Mapping):
+        raise ConfigError(f"{where}: {prefix.rstrip('.')} is {mapping!r}, expected a group of keys")
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls)]
+    unknown = [key for key in mapping if key not in names]
+    if unknown:
+        raise ConfigError(f"{where}: unknown key {prefix}{unknown[0]}; known keys here: {', '.join(names)}")
+    values = {key: _value(hints[key], value, where, prefix + key) for key, value in mapping.items()}
+    for field in dataclasses.fields(cls):
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and field.name not in values:
+            raise ConfigError(f"{where}: the key {prefix}{field.name} is missing")
+    try:
+        return cls(**values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {prefix}{error}") from error
+
+
+def _value(hint: Any, value: Any, where: str, key: str) -> Any:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        if value is None and type(None) in arguments:
+            return None
+        return _value(next(a for a in arguments if a is not type(None)), value, where, key)
+    if dataclasses.is_dataclass(hint):
+        return _build(typing.cast(type, hint), value, where, key + ".")
+    if origin is tuple and isinstance(value, list | tuple):
+        inner = [arguments[0]] * len(value) if arguments[-1] is Ellipsis else list(arguments)
+        if len(inner) == len(value):
+            return tuple(_value(h, v, where, f"{key}[{i}]") for i, (h, v) in enumerate(zip(inner, value, strict=True)))
+        raise ConfigError(f"{where}: {key} has {len(value)} entries, expected {len(inner)}")
+    if origin is typing.Literal:
+        if value in arguments:
+            return value
+        raise ConfigError(f"{where}: {key} is {value!r}, expected one of {', '.join(map(str, arguments))}")
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if hint is float and isinstance(value, str):  # YAML 1.1 reads 3e-4 as a string
+        try:
+            return float(value)
+        except ValueError:
+            pass
+    if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
+        return value
+    expected = getattr(hint, "__name__", str(hint))
+    raise ConfigError(f"{where}: {key} is {value!r}, expected {expected}")
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value):
+        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    return value
+
+
+def _copy(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    return {k: _copy(v) if isinstance(v, Mapping) else v for k, v in mapping.items()}

@@ -1,0 +1,205 @@
+"""Triangle meshes with vertex colours or a texture, in metres."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from jaxtyping import Float, Int, UInt8
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.distance import pdist
+
+from posecore.errors import MeshError
+from posecore.files import write_atomic
+
+Array = np.ndarray
+Units = Literal["mm", "cm", "m"]
+METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
+DIAMETER_RANGE_M = (2e-3, 10.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Mesh:
+    """A triangle mesh in object coordinates.
+
+    Attributes:
+        vertices_m: (v, 3) metres.
+        faces: (f, 3) vertex indices.
+        normals: (v, 3) unit vertex normals.
+        vertex_rgb: (v, 3) display (sRGB) colours, or None.
+        uv: (v, 2) texture coordinates, origin at the texture's bottom left, or None.
+        texture_rgb: (h, w, 3) display colours, row 0 at the top, or None.
+        path: Where it came from.
+        sha256: Hash of that file's bytes.
+    """
+
+    vertices_m: Float[Array, "v 3"]
+    faces: Int[Array, "f 3"]
+    normals: Float[Array, "v 3"]
+    vertex_rgb: UInt8[Array, "v 3"] | None = None
+    uv: Float[Array, "v 2"] | None = None
+    texture_rgb: UInt8[Array, "h w 3"] | None = None
+    path: str = ""
+    sha256: str = ""
+
+    @cached_property
+    def diameter_m(self) -> float:
+        """Largest distance between two vertices (BOP's definition), metres."""
+        return diameter(self.vertices_m)
+
+    @cached_property
+    def center_m(self) -> Float[Array, "3"]:
+        """Centre of the axis-aligned bounding box in object coordinates, metres."""
+        return np.asarray((self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2)
+
+    @cached_property
+    def colours(self) -> UInt8[Array, "v 3"]:
+        """Vertex colours; sampled from the texture where there is one, mid grey where there is nothing."""
+        if self.vertex_rgb is not None:
+            return self.vertex_rgb
+        if self.uv is not None and self.texture_rgb is not None:
+            h, w = self.texture_rgb.shape[:2]
+            column = np.floor((self.uv[:, 0] % 1.0) * w).astype(int).clip(0, w - 1)
+            row = np.floor((1.0 - self.uv[:, 1] % 1.0) * h).astype(int).clip(0, h - 1)
+            return self.texture_rgb[row, column]
+        return np.full((len(self.vertices_m), 3), 160, np.uint8)
+
+
+def diameter(points_m: Float[Array, "v 3"]) -> float:
+    """Largest distance between two points, over their convex hull."""
+    points = np.asarray(points_m, np.float64)
+    try:
+        points = points[ConvexHull(points).vertices]
+    except QhullError:  # flat or fewer than four points: every pair is looked at
+        points = np.unique(points, axis=0)
+    if len(points) > 4000:  # a sphere-like hull; the blockwise maximum keeps memory bounded
+        return max(float(np.linalg.norm(points - p, axis=1).max()) for p in points)
+    return float(pdist(points).max()) if len(points) > 1 else 0.0
+
+
+def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
+    """Read a PLY, OBJ, glTF, GLB, STL or OFF file.
+
+    Args:
+        path: The file. Several geometries in one file are merged.
+        units: Unit of the file's coordinates. glTF is in metres by its specification: say `m`.
+
+    Raises:
+        MeshError: Missing, unreadable, without faces, with NaN vertices, or of an absurd size in these units.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise MeshError(f"{file}: no such mesh file; give the path of a .ply, .obj, .gltf, .glb or .stl file")
+    data = file.read_bytes()
+    if not data:
+        raise MeshError(f"{file}: the file is empty (0 bytes), expected a mesh; export it again")
+    geometry = _read(file)
+    vertices = np.asarray(geometry.vertices, np.float64) * METRES_PER_UNIT[units]
+    faces = np.asarray(geometry.faces, np.int32)
+    if not np.isfinite(vertices).all():
+        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise MeshError(f"{file}: vertex {bad} is {vertices[bad].tolist()}, expected finite numbers; repair the mesh")
+    _check_diameter(file, diameter(vertices), units)
+    normals = np.asarray(geometry.vertex_normals, np.float32)
+    vertex_rgb, uv, texture_rgb = _appearance(file, geometry)
+    return Mesh(
+        vertices_m=vertices,
+        faces=faces,
+        normals=normals,
+        vertex_rgb=vertex_rgb,
+        uv=uv,
+        texture_rgb=texture_rgb,
+        path=str(file),
+        sha256=hashlib.sha256(data).hexdigest(),
+    )
+
+
+def _read(file: Path) -> trimesh.Trimesh:
+    try:
+        loaded = trimesh.load(file, process=False, maintain_order=True)
+    except Exception as error:  # readers raise whatever they stumble over
+        raise MeshError(
+            f"{file}: cannot be read as a mesh ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}); "
+            "expected a valid .ply, .obj, .gltf, .glb or .stl file"
+        ) from error
+    if isinstance(loaded, trimesh.Scene):
+        meshes = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
+        if not meshes:
+            raise MeshError(f"{file}: holds no triangle mesh; export the surface, not points or curves")
+        loaded = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
+    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
+        count = len(getattr(loaded, "vertices", ()))
+        raise MeshError(f"{file}: {count} vertices and no faces; a triangle mesh is needed, not a point cloud")
+    return loaded
+
+
+def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
+    low, high = DIAMETER_RANGE_M
+    if low <= diameter_m <= high:
+        return
+    fits = [u for u, s in METRES_PER_UNIT.items() if low <= diameter_m / METRES_PER_UNIT[units] * s <= high]
+    best = [u for u in ("m", "cm", "mm") if u in fits]
+    hint = f"; did you mean --units {best[0]}?" if best else "; check the mesh's scale"
+    raise MeshError(
+        f"{file}: the diameter is {diameter_m * 1e3:.6g} mm when read in {units}, "
+        f"expected {low * 1e3:g} mm to {high:g} m{hint}"
+    )
+
+
+def _appearance(
+    file: Path, geometry: trimesh.Trimesh
+) -> tuple[UInt8[Array, "v 3"] | None, Float[Array, "v 2"] | None, UInt8[Array, "h w 3"] | None]:
+    visual = geometry.visual
+    if isinstance(visual, trimesh.visual.TextureVisuals):
+        material = visual.material
+        image = getattr(material, "baseColorTexture", None)
+        image = image if image is not None else getattr(material, "image", None)
+        if visual.uv is not None and image is not None:
+            return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
+        _refuse_missing_texture(file)
+        plain = np.asarray(material.main_color, np.uint8)[:3]
+        return np.tile(plain, (len(geometry.vertices), 1)), None, None
+    if visual.kind is None:
+        return None, None, None
+    return np.ascontiguousarray(np.asarray(visual.vertex_colors, np.uint8)[:, :3]), None, None
+
+
+def _refuse_missing_texture(file: Path) -> None:
+    """A material that names an image which is not there is an error, never a silent grey."""
+    if file.suffix.lower() != ".obj":
+        return
+    for line in file.read_text(errors="replace").splitlines():
+        if not line.startswith("mtllib "):
+            continue
+        material = file.parent / line.split(maxsplit=1)[1].strip()
+        if not material.is_file():
+            raise MeshError(f"{file}: its material file {material} is missing; put it beside the mesh")
+        for entry in material.read_text(errors="replace").splitlines():
+            if entry.strip().startswith("map_Kd "):
+                texture = file.parent / entry.split(maxsplit=1)[1].strip()
+                if not texture.is_file():
+                    raise MeshError(f"{file}: its texture {texture} is missing; put it beside the mesh")
+
+
+def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
+    """Write a binary PLY with vertex normals and colours (a texture is sampled at the vertices)."""
+    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
+    columns += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
+    vertices = np.empty(len(mesh.vertices_m), columns)
+    for axis, name in enumerate("xyz"):
+        vertices[name] = mesh.vertices_m[:, axis] / METRES_PER_UNIT[units]
+        vertices["n" + name] = mesh.normals[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        vertices[name] = mesh.colours[:, channel]
+    faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", (3,))])
+    faces["count"], faces["index"] = 3, mesh.faces
+    names = {"<f4": "float", "u1": "uchar"}
+    properties = "".join(f"property {names[kind]} {name}\n" for name, kind in columns)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    write_atomic(path, header.encode() + vertices.tobytes() + faces.tobytes())

@@ -1,0 +1,370 @@
+"""The GL rasteriser: colour, camera z and instance of meshes at given poses, on EGL (a GPU, or software GL).
+
+It draws the hypothesis at inference and in training, silhouettes for the metrics, and whole scenes as the `raster`
+engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mask and depth are exact labels.
+`raster_reference` is the plain twin that tests hold this against.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, Self
+
+import moderngl
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from posecore.errors import RenderError
+from posecore.mesh import Mesh
+
+Array = np.ndarray
+MAX_LIGHTS = 8
+ATLAS_SIDE_PX = 2048  # tiles of one batch share a framebuffer of at most this side: one read-back for all of them
+
+VERTEX_SHADER = """
+#version 330
+uniform mat4 clip_from_cam;
+uniform mat4 cam_from_obj;
+in vec3 position;
+in vec3 normal;
+in vec3 colour;
+in vec2 uv;
+out vec3 p_cam;
+out vec3 n_cam;
+out vec3 base;
+out vec2 texcoord;
+void main() {
+    vec4 p = cam_from_obj * vec4(position, 1.0);
+    p_cam = p.xyz;
+    n_cam = mat3(cam_from_obj) * normal;
+    base = colour;
+    texcoord = uv;
+    gl_Position = clip_from_cam * p;
+}
+"""
+
+# Two-sided: many CAD meshes have flipped faces, so the normal is turned towards the camera.
+FRAGMENT_SHADER = """
+#version 330
+uniform sampler2D image;
+uniform bool textured;
+uniform vec3 tint;
+uniform float ambient;
+uniform float diffuse;
+uniform int n_lights;
+uniform vec3 light_direction[8];
+uniform vec3 light_rgb[8];
+uniform float instance;
+in vec3 p_cam;
+in vec3 n_cam;
+in vec3 base;
+in vec2 texcoord;
+layout(location = 0) out vec4 rgb;
+layout(location = 1) out vec2 depth_instance;
+void main() {
+    vec3 to_eye = normalize(-p_cam);
+    vec3 n = dot(n_cam, n_cam) > 1e-12 ? normalize(n_cam) : to_eye;
+    if (dot(n, to_eye) < 0.0) n = -n;
+    vec3 light = vec3(ambient);
+    if (n_lights == 0) light += diffuse * dot(n, to_eye);
+    for (int i = 0; i < n_lights; ++i) light += diffuse * light_rgb[i] * max(dot(n, light_direction[i]), 0.0);
+    vec3 own = textured ? texture(image, texcoord).rgb : base;
+    rgb = vec4(min(own * tint * light, 1.0), 1.0);
+    depth_instance = vec2(p_cam.z, instance);
+}
+"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirectionalLight:
+    """A light from infinity: unit direction towards it in the camera frame, and its colour."""
+
+    direction_cam: tuple[float, float, float]
+    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shading:
+    """Light model in display values: own colour x (ambient + diffuse x lights). Without lights, a headlight."""
+
+    ambient: float = 0.5
+    diffuse: float = 0.5
+    lights: tuple[DirectionalLight, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.lights) > MAX_LIGHTS:
+            raise RenderError(f"shading has {len(self.lights)} lights, expected at most {MAX_LIGHTS}")
+
+
+HEADLIGHT = Shading()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Instance:
+    """One object of a scene: which mesh, where, and a factor on its colours."""
+
+    obj_id: int
+    T_cam_obj: Float[Array, "4 4"]
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Layers:
+    """A batch of renders of one object each.
+
+    Attributes:
+        rgb: (b, h, w, 3) display colours on black, or None when not asked for.
+        depth_m: (b, h, w) camera z in metres, 0 where nothing was hit.
+    """
+
+    rgb: UInt8[Array, "b h w 3"] | None
+    depth_m: Float[Array, "b h w"]
+
+    @property
+    def mask(self) -> Bool[Array, "b h w"]:
+        """Silhouettes."""
+        return self.depth_m > 0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneLayers:
+    """One render of several objects; `instance` indexes them, -1 where nothing was hit."""
+
+    rgb: UInt8[Array, "h w 3"]
+    depth_m: Float[Array, "h w"]
+    instance: Int[Array, "h w"]
+
+
+class Rasteriser:
+    """Draws meshes at poses. One per process and thread; a context manager.
+
+    Args:
+        meshes: Meshes by object id; uploaded at their first use.
+
+    Raises:
+        RenderError: No EGL device (neither a GPU nor Mesa's software renderer).
+    """
+
+    def __init__(self, meshes: Mapping[int, Mesh]) -> None:
+        self._meshes = dict(meshes)
+        try:
+            self._context = moderngl.create_standalone_context(backend="egl", require=330)
+        except Exception as error:  # moderngl raises bare exceptions from several layers
+            raise RenderError(
+                f"no EGL device for the rasteriser ({str(error).splitlines()[0] if str(error) else type(error).__name__}); "
+                "install a GPU driver with EGL, or Mesa's software renderer (Debian: libegl1 libgl1-mesa-dri)"
+            ) from error
+        self._context.gc_mode = "auto"
+        self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
+        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self._textures: dict[int, moderngl.Texture] = {}
+        self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
+        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self._context.enable(moderngl.DEPTH_TEST)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def device(self) -> str:
+        """The GL renderer's own name."""
+        return str(self._context.info["GL_RENDERER"])
+
+    @property
+    def is_software(self) -> bool:
+        """Whether the processor draws, not a GPU."""
+        return any(name in self.device.lower() for name in ("llvmpipe", "softpipe", "swrast"))
+
+    def add(self, obj_id: int, mesh: Mesh) -> None:
+        """Add a mesh, or replace the one of this id."""
+        self._release(obj_id)
+        self._meshes[obj_id] = mesh
+
+    def close(self) -> None:
+        """Free the GL context and everything in it."""
+        for obj_id in list(self._arrays):
+            self._release(obj_id)
+        self._context.release()
+
+    def render(
+        self,
+        obj_id: int,
+        K: Float[Array, "*k 3 3"],
+        T_cam_obj: Float[Array, "b 4 4"],
+        width_px: int,
+        height_px: int,
+        *,
+        rgb: bool = True,
+        shading: Shading = HEADLIGHT,
+    ) -> Layers:
+        """Draw one object at a batch of poses, each in an image of its own.
+
+        Args:
+            obj_id: Which mesh.
+            K: One camera matrix for all, or one per pose (as crops have).
+            T_cam_obj: Poses, metres.
+            width_px: Width of each image.
+            height_px: Height of each image.
+            rgb: Whether colours are read back.
+            shading: Lights.
+        """
+        n = len(T_cam_obj)
+        K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
+        colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
+        depth = np.empty((n, height_px, width_px), np.float32)
+        columns = max(1, ATLAS_SIDE_PX // width_px)
+        rows = max(1, ATLAS_SIDE_PX // height_px)
+        self._set_shading(shading)
+        for start in range(0, n, columns * rows):
+            stop = min(start + columns * rows, n)
+            used_columns = min(columns, stop - start)
+            used_rows = -(-(stop - start) // used_columns)
+            target = self._begin(used_columns * width_px, used_rows * height_px)
+            for i in range(start, stop):
+                row, column = divmod(i - start, used_columns)
+                target.viewport = (column * width_px, row * height_px, width_px, height_px)
+                instance = Instance(obj_id=obj_id, T_cam_obj=T_cam_obj[i])
+                self._draw(instance, 0, K[i], width_px, height_px)
+            size = (used_columns * width_px, used_rows * height_px)
+            atlas_depth = _tiles(self._read(target, size, 1)[..., :1], used_rows, used_columns)[: stop - start]
+            depth[start:stop] = atlas_depth[..., 0]
+            if colours is not None:
+                colours[start:stop] = _tiles(self._read(target, size, 0), used_rows, used_columns)[: stop - start]
+        return Layers(rgb=colours, depth_m=depth)
+
+    def render_scene(
+        self,
+        instances: Sequence[Instance],
+        K: Float[Array, "3 3"],
+        width_px: int,
+        height_px: int,
+        *,
+        shading: Shading = HEADLIGHT,
+    ) -> SceneLayers:
+        """Draw several objects into one image."""
+        self._set_shading(shading)
+        target = self._begin(width_px, height_px)
+        target.viewport = (0, 0, width_px, height_px)
+        for index, instance in enumerate(instances):
+            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px)
+        size = (width_px, height_px)
+        colours, layer = self._read(target, size, 0), self._read(target, size, 1)
+        return SceneLayers(
+            rgb=colours.copy(), depth_m=layer[..., 0].copy(), instance=layer[..., 1].round().astype(np.int16) - 1
+        )
+
+    def _set_shading(self, shading: Shading) -> None:
+        program, lights = self._program, shading.lights
+        program["ambient"].value, program["diffuse"].value = shading.ambient, shading.diffuse
+        program["n_lights"].value = len(lights)
+        padding = [(0.0, 0.0, 1.0)] * (MAX_LIGHTS - len(lights))
+        program["light_direction"].value = [light.direction_cam for light in lights] + padding
+        program["light_rgb"].value = [light.rgb for light in lights] + padding
+
+    def _begin(self, width_px: int, height_px: int) -> moderngl.Framebuffer:
+        target = self._targets.get((width_px, height_px))
+        if target is None:
+            if len(self._targets) >= 8:  # sizes vary with batch and crop; a few are kept, the oldest goes
+                self._free(self._targets.pop(next(iter(self._targets))))
+            size = (width_px, height_px)
+            target = self._context.framebuffer(
+                [self._context.texture(size, 4), self._context.texture(size, 2, dtype="f4")],
+                self._context.depth_texture(size),
+            )
+            self._targets[width_px, height_px] = target
+        target.use()
+        target.viewport = (0, 0, width_px, height_px)
+        target.clear(0.0, 0.0, 0.0, 0.0)
+        return target
+
+    def _draw(self, instance: Instance, label: int, K: Float[Array, "3 3"], width_px: int, height_px: int) -> None:
+        mesh = self._mesh(instance.obj_id)
+        array = self._array(instance.obj_id, mesh)
+        T = np.asarray(instance.T_cam_obj, np.float64)
+        reach = mesh.diameter_m
+        z = float(T[2, :3] @ mesh.center_m + T[2, 3])
+        if z + reach <= 1e-4:
+            return
+        clip = _clip_from_cam(K, width_px, height_px, near_m=max(1e-3, 0.05 * abs(z)), far_m=100.0)
+        program = self._program
+        program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
+        program["cam_from_obj"].write(T.T.astype("f4").tobytes())
+        program["tint"].value = instance.tint
+        program["instance"].value = float(label)
+        texture = self._textures.get(instance.obj_id)
+        program["textured"].value = texture is not None
+        (texture or self._blank).use(0)
+        array.render(moderngl.TRIANGLES)
+
+    def _read(self, target: moderngl.Framebuffer, size: tuple[int, int], attachment: int) -> Array:
+        width, height = size
+        if attachment == 0:
+            data = target.read(viewport=(0, 0, width, height), components=3, attachment=0, alignment=1)
+            return np.frombuffer(data, np.uint8).reshape(height, width, 3)
+        data = target.read(viewport=(0, 0, width, height), components=2, attachment=1, dtype="f4", alignment=1)
+        return np.frombuffer(data, np.float32).reshape(height, width, 2)
+
+    def _mesh(self, obj_id: int) -> Mesh:
+        if obj_id not in self._meshes:
+            raise RenderError(f"object {obj_id} has no mesh here; there are meshes for {sorted(self._meshes)}")
+        return self._meshes[obj_id]
+
+    def _array(self, obj_id: int, mesh: Mesh) -> moderngl.VertexArray:
+        if obj_id in self._arrays:
+            return self._arrays[obj_id]
+        textured = mesh.uv is not None and mesh.texture_rgb is not None
+        uv = mesh.uv if textured else np.zeros((len(mesh.vertices_m), 2))
+        vertices = np.hstack([mesh.vertices_m, mesh.normals, mesh.colours / 255.0, uv]).astype("f4")
+        layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
+        index = self._context.buffer(mesh.faces.astype("i4").tobytes())
+        self._arrays[obj_id] = self._context.vertex_array(self._program, [layout], index)
+        if textured:
+            assert mesh.texture_rgb is not None
+            height, width = mesh.texture_rgb.shape[:2]
+            flipped = np.ascontiguousarray(mesh.texture_rgb[::-1])  # GL's first row is the bottom one
+            texture = self._context.texture((width, height), 3, flipped.tobytes(), alignment=1)
+            texture.build_mipmaps()
+            texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+            self._textures[obj_id] = texture
+        return self._arrays[obj_id]
+
+    def _release(self, obj_id: int) -> None:
+        for store in (self._arrays, self._textures):
+            held = store.pop(obj_id, None)
+            if held is not None:
+                held.release()
+
+    def _free(self, target: moderngl.Framebuffer) -> None:
+        for attachment in (*target.color_attachments, target.depth_attachment):
+            if attachment is not None:
+                attachment.release()
+        target.release()
+
+
+def _clip_from_cam(
+    K: Float[Array, "3 3"], width_px: int, height_px: int, near_m: float, far_m: float
+) -> Float[Array, "4 4"]:
+    """Projection to GL clip space with image row 0 at the framebuffer's first row, so nothing is flipped on reading."""
+    w, h = float(width_px), float(height_px)
+    depth_scale = (far_m + near_m) / (far_m - near_m)
+    depth_shift = -2.0 * far_m * near_m / (far_m - near_m)
+    return np.array(
+        [
+            [2 * K[0, 0] / w, 0.0, 2 * K[0, 2] / w - 1.0, 0.0],
+            [0.0, 2 * K[1, 1] / h, 2 * K[1, 2] / h - 1.0, 0.0],
+            [0.0, 0.0, depth_scale, depth_shift],
+            [0.0, 0.0, 1.0, 0.0],
+        ]
+    )
+
+
+def _tiles(atlas: Array, rows: int, columns: int) -> Array:
+    """Split (rows*h, columns*w, c) into (rows*columns, h, w, c)."""
+    height, width, channels = atlas.shape
+    grid = atlas.reshape(rows, height // rows, columns, width // columns, channels)
+    return np.asarray(grid.swapaxes(1, 2).reshape(rows * columns, height // rows, width // columns, channels))

@@ -1,0 +1,113 @@
+"""Rigid transforms as 4 x 4 matrices.
+
+`T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`. Lengths are metres, angles radians.
+A pose update (dR, dt) is in camera axes about the object's origin: R' = dR R, t' = t + dt.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+Array = np.ndarray
+
+
+def make_T(R: Float[Array, "*b 3 3"], t: Float[Array, "*b 3"]) -> Float[Array, "*b 4 4"]:
+    """Assemble a transform from rotation and translation (metres)."""
+    R, t = np.asarray(R, np.float64), np.asarray(t, np.float64)
+    T = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    T[..., :3, :3] = R
+    T[..., :3, 3] = t
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def inverse(T: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
+    """Invert a rigid transform: `inverse(T_a_b)` is `T_b_a`."""
+    R_inv = np.swapaxes(T[..., :3, :3], -1, -2)
+    return make_T(R_inv, -(R_inv @ T[..., :3, 3:])[..., 0])
+
+
+def apply(T: Float[Array, "*b 4 4"], points: Float[Array, "*c n 3"]) -> Float[Array, "*d n 3"]:
+    """Transform points (metres); batch axes of both broadcast."""
+    return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+
+
+def rotation_angle_rad(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
+    """Angle of a rotation in [0, pi], exact also near 0 and pi (unlike the arc cosine of the trace)."""
+    skew = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    sine = np.linalg.norm(skew, axis=-1) / 2.0
+    cosine = (np.trace(R, axis1=-2, axis2=-1) - 1.0) / 2.0
+    return np.asarray(np.arctan2(sine, cosine))
+
+
+def rotation_from_rotvec(rotvec: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """Rotation about `rotvec`'s direction by its length (radians)."""
+    flat = Rotation.from_rotvec(np.asarray(rotvec, np.float64).reshape(-1, 3)).as_matrix()
+    return np.asarray(flat.reshape(*rotvec.shape[:-1], 3, 3))
+
+
+def rotvec_from_rotation(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """Axis times angle (radians) of a rotation."""
+    flat = Rotation.from_matrix(np.asarray(R, np.float64).reshape(-1, 3, 3)).as_rotvec()
+    return np.asarray(flat.reshape(*R.shape[:-2], 3))
+
+
+def rotation_from_quat_wxyz(quat_wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
+    """Rotation of a quaternion (w, x, y, z) of any non-zero length."""
+    flat = np.asarray(quat_wxyz, np.float64).reshape(-1, 4)
+    R = Rotation.from_quat(flat[:, [1, 2, 3, 0]]).as_matrix()
+    return np.asarray(R.reshape(*quat_wxyz.shape[:-1], 3, 3))
+
+
+def quat_wxyz_from_rotation(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
+    """Unit quaternion (w, x, y, z) with w >= 0."""
+    xyzw = Rotation.from_matrix(np.asarray(R, np.float64).reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.asarray(xyzw[:, [3, 0, 1, 2]].reshape(*R.shape[:-2], 4))
+
+
+def random_rotation(rng: np.random.Generator) -> Float[Array, "3 3"]:
+    """Rotation drawn uniformly from SO(3) (normalised Gaussian quaternion)."""
+    return rotation_from_quat_wxyz(rng.normal(size=4))
+
+
+def random_direction(rng: np.random.Generator) -> Float[Array, "3"]:
+    """Unit vector drawn uniformly from the sphere."""
+    v = rng.normal(size=3)
+    return np.asarray(v / np.linalg.norm(v))
+
+
+def is_rotation(R: Float[Array, "*b 3 3"], tol: float = 1e-3) -> Bool[Array, "*b"]:
+    """Whether R is orthonormal with determinant +1, every entry of R R^T within `tol` of the identity."""
+    residual = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+    return np.asarray((residual <= tol) & (np.linalg.det(R) > 0))
+
+
+def nearest_rotation(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Closest rotation in the Frobenius norm (orthogonal Procrustes, by SVD)."""
+    U, _, Vt = np.linalg.svd(R)
+    U = U.copy()
+    U[..., :, 2] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    return np.asarray(U @ Vt)
+
+
+def apply_update(
+    T_cam_obj: Float[Array, "*b 4 4"], dR: Float[Array, "*b 3 3"], dt_m: Float[Array, "*b 3"]
+) -> Float[Array, "*b 4 4"]:
+    """Update a pose in camera axes about the object's origin: R' = dR R, t' = t + dt."""
+    return make_T(dR @ T_cam_obj[..., :3, :3], T_cam_obj[..., :3, 3] + dt_m)
+
+
+def update_between(
+    T_from: Float[Array, "*b 4 4"], T_to: Float[Array, "*b 4 4"]
+) -> tuple[Float[Array, "*b 3 3"], Float[Array, "*b 3"]]:
+    """The update (dR, dt in metres) with `apply_update(T_from, dR, dt) == T_to`."""
+    dR = T_to[..., :3, :3] @ np.swapaxes(T_from[..., :3, :3], -1, -2)
+    return dR, T_to[..., :3, 3] - T_from[..., :3, 3]
+
+
+def perturb(
+    T_cam_obj: Float[Array, "4 4"], angle_rad: float, distance_m: float, rng: np.random.Generator
+) -> Float[Array, "4 4"]:
+    """Rotate a pose by `angle_rad` about a random axis and move its origin by `distance_m` in a random direction."""
+    dR = rotation_from_rotvec(random_direction(rng) * angle_rad)
+    return apply_update(T_cam_obj, dR, random_direction(rng) * distance_m)

@@ -1,0 +1,84 @@
+"""The contract that every rendering engine keeps, and the one place that turns an engine's name into an engine."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, Protocol, get_args, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, Int16
+from posecore.errors import ConfigError
+from posecore.mesh import Mesh
+
+from synthgen.scene import Scene
+
+EngineName = Literal["cycles", "eevee", "raster"]
+Device = Literal["cpu", "gpu"]
+
+ENGINE_NAMES: tuple[str, ...] = get_args(EngineName)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class RenderedScene:
+    """The layers of one rendered region; row 0 is the top.
+
+    Attributes:
+        rgb_linear: (h, w, 3) linear scene radiance, straight (not multiplied by alpha); 0 where alpha is 0.
+        alpha: (h, w) coverage of the pixel in [0, 1], antialiased.
+        depth_m: (h, w) camera z of the surface at the pixel's centre, 0 where there is none.
+        index: (h, w) position in `Scene.objects` of the surface at the pixel's centre, -1 where there is none.
+            `index >= 0` exactly where `depth_m > 0`.
+    """
+
+    rgb_linear: Float[np.ndarray, "h w 3"]
+    alpha: Float[np.ndarray, "h w"]
+    depth_m: Float[np.ndarray, "h w"]
+    index: Int16[np.ndarray, "h w"]
+
+
+@runtime_checkable
+class Engine(Protocol):
+    """Turns scenes into layers. One engine serves one process, for as many scenes as wanted."""
+
+    name: str
+
+    def load(self, meshes: Mapping[int, Mesh]) -> None:
+        """Make the meshes known under their keys; a key that is known already is replaced.
+
+        Raises:
+            MeshError: The engine cannot take a mesh.
+        """
+
+    def render(self, scene: Scene) -> RenderedScene:
+        """Render `scene.region_px`.
+
+        The result depends on the scene and the loaded meshes alone: not on earlier scenes or the number of threads.
+
+        Raises:
+            RenderError: A mesh key is unknown or the renderer failed.
+        """
+
+    def close(self) -> None:
+        """Free what the engine holds. Closing twice does nothing."""
+
+
+def make_engine(name: str, *, threads: int = 0, device: Device = "cpu") -> Engine:
+    """Make an engine by name; only then is what it needs imported.
+
+    Args:
+        name: 'cycles' (path tracing, the default elsewhere), 'eevee' (for GPUs) or 'raster' (drafts, no Blender).
+        threads: Threads a Blender engine may use, 0 for all cores.
+        device: Where Cycles traces; the other engines draw with OpenGL and take what it gives.
+
+    Raises:
+        ConfigError: The name is unknown.
+        RenderError: The engine cannot start here, e.g. because Blender's module is not installed.
+    """
+    if name == "raster":
+        from synthgen.raster_engine import RasterEngine
+
+        return RasterEngine()
+    if name == "cycles" or name == "eevee":
+        from synthgen.blender.engine import BlenderEngine
+
+        return BlenderEngine(name, threads=threads, device=device)
+    raise ConfigError(f"engine: got {name!r}, expected one of {', '.join(ENGINE_NAMES)}")
