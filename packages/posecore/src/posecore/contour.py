@@ -16,7 +16,7 @@ def contour_mask(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
 
     Where the silhouette is cut by the patch's border there is no contour: what lies outside counts as silhouette.
     """
-    inner = cv2.erode(mask.astype(np.uint8), _SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=1)
+    inner = cv2.erode(mask.astype(np.uint8), _SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=[1])
     return np.asarray(mask & (inner == 0))
 
 

@@ -1,5 +1,6 @@
 """Whole-file writes, hashes and the data files that ship with the project."""
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -24,7 +25,8 @@ def write_atomic(path: str | Path, data: bytes) -> None:
             os.fsync(stream.fileno())
         os.replace(temporary, file)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
         raise storage_error(file, error, len(data)) from error
 
 

@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -64,7 +64,7 @@ class Mesh:
             h, w = self.texture_rgb.shape[:2]
             column = np.floor((self.uv[:, 0] % 1.0) * w).astype(int).clip(0, w - 1)
             row = np.floor((1.0 - self.uv[:, 1] % 1.0) * h).astype(int).clip(0, h - 1)
-            return self.texture_rgb[row, column]
+            return np.asarray(self.texture_rgb[row, column])
         return np.full((len(self.vertices_m), 3), 160, np.uint8)
 
 
@@ -121,9 +121,9 @@ def _read(file: Path) -> trimesh.Trimesh:
     try:
         loaded = trimesh.load(file, process=False, maintain_order=True)
     except Exception as error:  # readers raise whatever they stumble over
+        reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
         raise MeshError(
-            f"{file}: cannot be read as a mesh ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}); "
-            "expected a valid .ply, .obj, .gltf, .glb or .stl file"
+            f"{file}: cannot be read as a mesh ({reason}); expected a valid .ply, .obj, .gltf, .glb or .stl file"
         ) from error
     if isinstance(loaded, trimesh.Scene):
         meshes = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
@@ -152,14 +152,13 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
 def _appearance(
     file: Path, geometry: trimesh.Trimesh
 ) -> tuple[UInt8[Array, "v 3"] | None, Float[Array, "v 2"] | None, UInt8[Array, "h w 3"] | None]:
-    visual = geometry.visual
-    if isinstance(visual, trimesh.visual.TextureVisuals):
-        material = visual.material
-        image = getattr(material, "baseColorTexture", None)
-        image = image if image is not None else getattr(material, "image", None)
-        if visual.uv is not None and image is not None:
-            return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
-        _refuse_missing_texture(file)
+    _refuse_missing_texture(file)
+    visual: Any = geometry.visual
+    material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    if image is not None and visual.uv is not None:
+        return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
+    if material is not None:
         plain = np.asarray(material.main_color, np.uint8)[:3]
         return np.tile(plain, (len(geometry.vertices), 1)), None, None
     if visual.kind is None:

@@ -8,7 +8,7 @@ engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mas
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -148,10 +148,12 @@ class Rasteriser:
     def __init__(self, meshes: Mapping[int, Mesh]) -> None:
         self._meshes = dict(meshes)
         try:
-            self._context = moderngl.create_standalone_context(backend="egl", require=330)
+            settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
+            self._context: Any = moderngl.create_context(**settings)
         except Exception as error:  # moderngl raises bare exceptions from several layers
+            reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
             raise RenderError(
-                f"no EGL device for the rasteriser ({str(error).splitlines()[0] if str(error) else type(error).__name__}); "
+                f"no EGL device for the rasteriser ({reason}); "
                 "install a GPU driver with EGL, or Mesa's software renderer (Debian: libegl1 libgl1-mesa-dri)"
             ) from error
         self._context.gc_mode = "auto"
@@ -162,7 +164,7 @@ class Rasteriser:
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
         self._context.enable(moderngl.DEPTH_TEST)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "Rasteriser":
         return self
 
     def __exit__(
@@ -213,6 +215,7 @@ class Rasteriser:
             rgb: Whether colours are read back.
             shading: Lights.
         """
+        self._context.__enter__()  # contexts share one "current" per thread; another Rasteriser may have taken it
         n = len(T_cam_obj)
         K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
@@ -229,7 +232,7 @@ class Rasteriser:
                 row, column = divmod(i - start, used_columns)
                 target.viewport = (column * width_px, row * height_px, width_px, height_px)
                 instance = Instance(obj_id=obj_id, T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], width_px, height_px)
+                self._draw(instance, 0, K[i], width_px, height_px, near_m=_near_m([instance.T_cam_obj]))
             size = (used_columns * width_px, used_rows * height_px)
             atlas_depth = _tiles(self._read(target, size, 1)[..., :1], used_rows, used_columns)[: stop - start]
             depth[start:stop] = atlas_depth[..., 0]
@@ -247,11 +250,13 @@ class Rasteriser:
         shading: Shading = HEADLIGHT,
     ) -> SceneLayers:
         """Draw several objects into one image."""
+        self._context.__enter__()
         self._set_shading(shading)
         target = self._begin(width_px, height_px)
         target.viewport = (0, 0, width_px, height_px)
+        near_m = _near_m([instance.T_cam_obj for instance in instances])  # one depth range for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m)
         size = (width_px, height_px)
         colours, layer = self._read(target, size, 0), self._read(target, size, 1)
         return SceneLayers(
@@ -282,15 +287,15 @@ class Rasteriser:
         target.clear(0.0, 0.0, 0.0, 0.0)
         return target
 
-    def _draw(self, instance: Instance, label: int, K: Float[Array, "3 3"], width_px: int, height_px: int) -> None:
+    def _draw(
+        self, instance: Instance, label: int, K: Float[Array, "3 3"], width_px: int, height_px: int, near_m: float
+    ) -> None:
         mesh = self._mesh(instance.obj_id)
         array = self._array(instance.obj_id, mesh)
         T = np.asarray(instance.T_cam_obj, np.float64)
-        reach = mesh.diameter_m
-        z = float(T[2, :3] @ mesh.center_m + T[2, 3])
-        if z + reach <= 1e-4:
+        if float(T[2, :3] @ mesh.center_m + T[2, 3]) + mesh.diameter_m <= near_m:
             return
-        clip = _clip_from_cam(K, width_px, height_px, near_m=max(1e-3, 0.05 * abs(z)), far_m=100.0)
+        clip = _clip_from_cam(K, width_px, height_px, near_m, far_m=100.0)
         program = self._program
         program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
         program["cam_from_obj"].write(T.T.astype("f4").tobytes())
@@ -318,7 +323,7 @@ class Rasteriser:
         if obj_id in self._arrays:
             return self._arrays[obj_id]
         textured = mesh.uv is not None and mesh.texture_rgb is not None
-        uv = mesh.uv if textured else np.zeros((len(mesh.vertices_m), 2))
+        uv = np.zeros((len(mesh.vertices_m), 2)) if mesh.uv is None else mesh.uv
         vertices = np.hstack([mesh.vertices_m, mesh.normals, mesh.colours / 255.0, uv]).astype("f4")
         layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
         index = self._context.buffer(mesh.faces.astype("i4").tobytes())
@@ -344,6 +349,12 @@ class Rasteriser:
             if attachment is not None:
                 attachment.release()
         target.release()
+
+
+def _near_m(T_cam_obj: Sequence[Float[Array, "4 4"]]) -> float:
+    """Near plane: close enough to cut nothing in practice, far enough for a 24-bit depth buffer to keep order."""
+    in_front = [float(T[2, 3]) for T in T_cam_obj if T[2, 3] > 0]
+    return max(1e-3, 0.05 * min(in_front, default=0.0))
 
 
 def _clip_from_cam(

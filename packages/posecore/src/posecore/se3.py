@@ -29,7 +29,7 @@ def inverse(T: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
 
 def apply(T: Float[Array, "*b 4 4"], points: Float[Array, "*c n 3"]) -> Float[Array, "*d n 3"]:
     """Transform points (metres); batch axes of both broadcast."""
-    return points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+    return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
 def rotation_angle_rad(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:

@@ -67,11 +67,13 @@ class Field:
                 f"{self.name}: values from {np.min(values)} to {np.max(values)} {self.unit}, "
                 f"expected 0 to {limit * self.scale:g} {self.unit} (what {self.dtype} steps of {self.scale:g} hold)"
             )
-        return stored.astype(self.dtype)
+        return np.asarray(stored.astype(self.dtype))
 
     def decode(self, stored: Array) -> Array:
         """What is stored to values in `unit` (float32 where scaled)."""
-        return stored if self.scale is None else (stored.astype(np.float32) * np.float32(self.scale))
+        return (
+            np.asarray(stored) if self.scale is None else np.asarray(stored.astype(np.float32) * np.float32(self.scale))
+        )
 
 
 @cache
@@ -180,7 +182,9 @@ class ShardReader:
         self._store = open_store(self.url)
         group = self._store.get(GROUP)
         if group is None:
-            raise ShardError(f"{self.url}: no {GROUP} here, so this is no shard dataset; make one with `synthgen render`")
+            raise ShardError(
+                f"{self.url}: no {GROUP} here, so this is no shard dataset; make one with `synthgen render`"
+            )
         self.card = _card(self.url, group)
         self.refresh()
 
@@ -252,7 +256,7 @@ class ShardReader:
                 )
             _put(scratch, _shard_key(name, 0, self.card), data)
         _make_group(scratch, {**self.card, "n": self.shard_size}, wanted)
-        group = zarr.open_group(scratch, mode="r")
+        group: Any = zarr.open_group(scratch, mode="r")
         values = {}
         for name in wanted:
             try:
@@ -272,7 +276,7 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
     count = samples_in(card, shard_id)
     scratch = MemoryStore()
     _make_group(scratch, {**card, "n": card["shard_size"]})
-    group = zarr.open_group(scratch, mode="r+")
+    group: Any = zarr.open_group(scratch, mode="r+")
     for field in field_table():
         shape = (count, *field.size(card["patch_px"], card["contour_points"]))
         if field.name not in arrays or arrays[field.name].shape != shape:
@@ -323,7 +327,10 @@ def _make_group(store: MemoryStore, card: Mapping[str, Any], names: Sequence[str
             compressors=_compressor(field.codec),
             filters=None,
             config={"write_empty_chunks": True},  # an all-zero patch is data, not a hole
-            dimension_names=["sample", *[str(s) if isinstance(s, str) else f"axis{i}" for i, s in enumerate(field.shape)]],
+            dimension_names=[
+                "sample",
+                *[str(s) if isinstance(s, str) else f"axis{i}" for i, s in enumerate(field.shape)],
+            ],
             attributes={"unit": field.unit, "scale": field.scale, "text": field.text},
         )
 

@@ -1,12 +1,13 @@
 """Where a dataset's files lie: a local folder, or any fsspec URL (s3://, gs://, memory://)."""
 
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from posecore.errors import ConfigError, StorageError
 from posecore.files import storage_error, write_atomic
 
 
+@runtime_checkable
 class Store(Protocol):
     """A flat key-value view of a folder. `set` is atomic: a reader sees the old bytes or the new ones."""
 

@@ -1,10 +1,12 @@
 """Object symmetries: the transforms that map an object onto itself, sampled finely enough to take a minimum over."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
+
+Array = np.ndarray
 
 BOP_STEP_RAD = 0.02
 """bop_toolkit's default: no surface point moves by more than 0.01 diameters between neighbouring samples."""
@@ -13,8 +15,7 @@ BALL_STEP_RAD = np.pi / 12
 """Sampling step of the full rotation group, which is three-dimensional: at BOP's step it would be 10 million poses."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ContinuousSymmetry:
+class ContinuousSymmetry(NamedTuple):
     """A rotation axis: every rotation about the line `offset_m + s * axis` maps the object onto itself.
 
     Attributes:
@@ -26,9 +27,24 @@ class ContinuousSymmetry:
     offset_m: tuple[float, float, float]
 
 
+@runtime_checkable
+class Symmetric(Protocol):
+    """What has symmetries: `posecore.bop.ModelInfo`."""
+
+    @property
+    def symmetries_discrete(self) -> tuple[Float[Array, "4 4"], ...]:
+        """Transforms in the object frame, metres, without the identity."""
+        ...
+
+    @property
+    def symmetries_continuous(self) -> tuple[ContinuousSymmetry, ...]:
+        """Rotation axes."""
+        ...
+
+
 def rotations_about_axis(
-    axis: Float[np.ndarray, "3"], angles_rad: Float[np.ndarray, " n"], offset_m: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "n 4 4"]:
+    axis: Float[Array, "3"], angles_rad: Float[Array, " n"], offset_m: Float[Array, "3"]
+) -> Float[Array, "n 4 4"]:
     """Rotate about the line through `offset_m` along `axis` (any length but zero), by each angle."""
     unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     cross = np.array([[0.0, -unit[2], unit[1]], [unit[2], 0.0, -unit[0]], [-unit[1], unit[0], 0.0]])
@@ -40,7 +56,7 @@ def rotations_about_axis(
     return transforms
 
 
-def _turns(step_rad: float) -> Float[np.ndarray, " n"]:
+def _turns(step_rad: float) -> Float[Array, " n"]:
     count = max(1, int(np.ceil(2.0 * np.pi / step_rad - 1e-9)))
     return np.arange(count) * (2.0 * np.pi / count)
 
@@ -51,7 +67,7 @@ def is_ball(continuous: Sequence[ContinuousSymmetry]) -> bool:
     return any(np.linalg.norm(np.cross(first, other.axis)) > 1e-3 for other in continuous[1:])
 
 
-def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[np.ndarray, "3"]:
+def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[Array, "3"]:
     """The point all axes of a ball pass through (least squares, object frame, metres)."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for symmetry in continuous:
@@ -61,7 +77,7 @@ def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[np.ndarray,
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
 
-def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: float) -> Float[np.ndarray, "n 4 4"]:
+def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: float) -> Float[Array, "n 4 4"]:
     if not continuous:
         return np.eye(4)[None]
     first = np.array(continuous[0].axis)
@@ -79,11 +95,7 @@ def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: f
     return np.concatenate([spins, body, tilts[-1] @ spins])
 
 
-def compose_symmetries(
-    discrete: Sequence[Float[np.ndarray, "4 4"]],
-    continuous: Sequence[ContinuousSymmetry],
-    max_step_rad: float = BOP_STEP_RAD,
-) -> Float[np.ndarray, "s 4 4"]:
+def symmetry_transforms(info: Symmetric, max_step_rad: float = BOP_STEP_RAD) -> Float[Array, "s 4 4"]:
     """All symmetries of an object: every sampled continuous one after the identity and every discrete one.
 
     The identity comes first. As in BOP, the discrete symmetries are taken as listed and not completed to a group.
@@ -91,23 +103,22 @@ def compose_symmetries(
     give all rotations about their common point (at a coarser step, see `BALL_STEP_RAD`; `align_ball` is exact).
 
     Args:
-        discrete: transforms in the object frame, metres, without the identity.
-        continuous: rotation axes.
+        info: discrete and continuous symmetries of the object.
         max_step_rad: largest angle between neighbouring samples of one axis.
 
     Returns:
         Transforms S with `T_cam_obj @ S` looking the same as `T_cam_obj`.
     """
-    fixed = np.stack([np.eye(4), *[np.asarray(transform, dtype=np.float64) for transform in discrete]])
-    turning = _continuous_transforms(continuous, max_step_rad)
-    return np.einsum("cij,djk->dcik", turning, fixed).reshape(-1, 4, 4)
+    fixed = np.stack([np.eye(4), *info.symmetries_discrete])
+    turning = _continuous_transforms(info.symmetries_continuous, max_step_rad)
+    return np.asarray(np.einsum("cij,djk->cdik", turning, fixed).reshape(-1, 4, 4))
 
 
 def align_ball(
     continuous: Sequence[ContinuousSymmetry],
-    T_cam_obj: Float[np.ndarray, "4 4"],
-    T_cam_obj_other: Float[np.ndarray, "4 4"],
-) -> Float[np.ndarray, "4 4"]:
+    T_cam_obj: Float[Array, "4 4"],
+    T_cam_obj_other: Float[Array, "4 4"],
+) -> Float[Array, "4 4"]:
     """The ball's symmetry S that gives `T_cam_obj @ S` the rotation of `T_cam_obj_other`: exact, no sampling."""
     center = ball_center_m(continuous)
     S = np.eye(4)

@@ -1,0 +1,216 @@
+"""Writing BOP datasets: a frame at a time, images first, the JSON that makes it count last."""
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from posecore.bop.dataset import GroundTruth, Target
+from posecore.bop.images import write_image
+from posecore.bop.jsonfile import as_list, integer_keys, read_json, write_json
+from posecore.bop.models_info import MM, ModelInfo, save_models_info
+from posecore.camera import Camera
+from posecore.errors import DatasetError
+from posecore.files import write_atomic
+from posecore.mesh import Mesh, save_ply
+
+Array = np.ndarray
+SCENE_FILES = ("scene_gt_info.json", "scene_camera.json", "scene_gt.json")
+"""In writing order: a frame exists once scene_gt.json names it."""
+
+
+class BopWriter:
+    """Writes one scene. A scene that exists already is continued; a frame that exists is replaced."""
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        scene_id: int,
+        *,
+        depth_scale: float = 0.1,
+        image_format: str = "png",
+        jpeg_quality: int = 95,
+    ) -> None:
+        """Open a scene for writing.
+
+        Args:
+            root: dataset folder.
+            split: split folder's name.
+            scene_id: number of the scene folder.
+            depth_scale: millimetres for one step of the 16-bit depth image.
+            image_format: png or jpg.
+            jpeg_quality: 1 to 100, for jpg.
+
+        Raises:
+            DatasetError: another image format, or the scene's JSON files are broken.
+        """
+        if image_format not in ("png", "jpg"):
+            raise DatasetError(f"image format: found '{image_format}', expected png or jpg")
+        self.root = Path(root)
+        self.scene_path = self.root / split / f"{scene_id:06d}"
+        self.depth_scale, self.image_format, self.jpeg_quality = depth_scale, image_format, jpeg_quality
+        self._entries: dict[str, dict[int, str]] = {name: self._existing(name) for name in SCENE_FILES}
+
+    def _existing(self, name: str) -> dict[int, str]:
+        file = self.scene_path / name
+        content = integer_keys(read_json(file), file) if file.is_file() else {}
+        return {im_id: json.dumps(entry) for im_id, entry in content.items()}
+
+    def __enter__(self) -> "BopWriter":
+        """Use the writer in a with statement."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Close the scene."""
+        self.close()
+
+    @property
+    def im_ids(self) -> list[int]:
+        """Frames that are complete on disk."""
+        return sorted(self._entries["scene_gt.json"])
+
+    def add_frame(
+        self,
+        im_id: int,
+        rgb: UInt8[Array, "h w 3"],
+        depth_m: Float[Array, "h w"] | None,
+        camera: Camera,
+        gts: Sequence[GroundTruth],
+        masks: Sequence[Bool[Array, "mh mw"]],
+        masks_visib: Sequence[Bool[Array, "h w"]],
+        *,
+        mask_origin_px: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Write one frame; it counts once this returns.
+
+        Args:
+            im_id: image number.
+            rgb: colour image.
+            depth_m: camera z, 0 where unknown; None for a dataset without depth.
+            camera: intrinsics of this image.
+            gts: annotated objects.
+            masks: full silhouette of each object, as if nothing stood before it. It may be larger than the image, so
+                that boxes and pixel counts cover parts outside of it.
+            masks_visib: visible part of each silhouette.
+            mask_origin_px: column and row in `masks` where the image's top left pixel lies.
+
+        Raises:
+            DatasetError: counts or sizes disagree, or a depth does not fit into 16 bits.
+        """
+        size = rgb.shape[:2]
+        where = f"{self.scene_path}, image {im_id}"
+        if len(gts) != len(masks) or len(gts) != len(masks_visib):
+            raise DatasetError(f"{where}: {len(gts)} objects, {len(masks)} masks, {len(masks_visib)} visible masks")
+        if size != (camera.height_px, camera.width_px):
+            raise DatasetError(f"{where}: the image is {size[1]} x {size[0]}, the camera says otherwise")
+        column, row = mask_origin_px
+        cropped = [mask[row : row + size[0], column : column + size[1]] for mask in masks]
+        if any(mask.shape != size for mask in [*cropped, *masks_visib]):
+            raise DatasetError(f"{where}: a mask does not cover the image of {size[1]} x {size[0]} pixels")
+        self._write_images(im_id, rgb, depth_m, where)
+        info = []
+        for index, (full, inside, visible) in enumerate(zip(masks, cropped, masks_visib, strict=True)):
+            self._write_mask("mask", im_id, index, inside)
+            self._write_mask("mask_visib", im_id, index, visible)
+            info.append(gt_info(full, inside, visible, depth_m, mask_origin_px))
+        camera_entry = {"cam_K": as_list(camera.K), "depth_scale": self.depth_scale}
+        self._commit(im_id, [info, camera_entry, [_gt_entry(gt) for gt in gts]])
+        if not (self.root / "camera.json").exists():
+            write_camera(self.root, camera, self.depth_scale)
+
+    def _write_images(
+        self, im_id: int, rgb: UInt8[Array, "h w 3"], depth_m: Float[Array, "h w"] | None, where: str
+    ) -> None:
+        name = f"{im_id:06d}"
+        write_image(self.scene_path / "rgb" / f"{name}.{self.image_format}", rgb, self.jpeg_quality)
+        if depth_m is None:
+            return
+        steps = np.rint(np.asarray(depth_m, np.float64) / (MM * self.depth_scale))
+        if steps.min() < 0 or steps.max() > 65535 or not np.isfinite(steps).all():
+            limit = 65535 * self.depth_scale * MM
+            raise DatasetError(f"{where}: a depth is outside 0 to {limit:.3g} m; choose a larger depth scale")
+        write_image(self.scene_path / "depth" / f"{name}.png", steps.astype(np.uint16))
+
+    def _write_mask(self, folder: str, im_id: int, index: int, mask: Bool[Array, "h w"]) -> None:
+        write_image(self.scene_path / folder / f"{im_id:06d}_{index:06d}.png", mask.astype(np.uint8) * 255)
+
+    def _commit(self, im_id: int, entries: Sequence[Any]) -> None:
+        for name, entry in zip(SCENE_FILES, entries, strict=True):
+            lines = self._entries[name]
+            lines[im_id] = json.dumps(entry)
+            body = ",\n".join(f'  "{key}": {lines[key]}' for key in sorted(lines))
+            write_atomic(self.scene_path / name, f"{{\n{body}\n}}\n".encode())
+
+    def close(self) -> None:
+        """End the scene. Every frame is on disk already: this only makes a second `add_frame` impossible."""
+        self._entries = {}
+
+
+def gt_info(
+    full: Bool[Array, "mh mw"],
+    inside: Bool[Array, "h w"],
+    visible: Bool[Array, "h w"],
+    depth_m: Float[Array, "h w"] | None,
+    mask_origin_px: tuple[int, int] = (0, 0),
+) -> dict[str, Any]:
+    """The entry of `scene_gt_info.json` for one object.
+
+    Definitions are those of bop_toolkit's calc_gt_info: `px_count_all` counts the whole silhouette, also outside the
+    image; `px_count_valid` its pixels in the image whose depth is known (all of them without depth);
+    `visib_fract` = visible / all; a box is x, y of its first pixel and last minus first pixel as width and height, and
+    all -1 where nothing is visible.
+    """
+    count_all, count_visible = int(full.sum()), int(visible.sum())
+    valid = inside if depth_m is None else inside & (depth_m > 0)
+    return {
+        "bbox_obj": _box(full, mask_origin_px) if count_visible else [-1] * 4,
+        "bbox_visib": _box(visible, (0, 0)),
+        "px_count_all": count_all,
+        "px_count_valid": int(valid.sum()),
+        "px_count_visib": count_visible,
+        "visib_fract": count_visible / count_all if count_all else 0.0,
+    }
+
+
+def _box(mask: Bool[Array, "h w"], origin_px: tuple[int, int]) -> list[int]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return [-1] * 4
+    left, top = int(columns[0]) - origin_px[0], int(rows[0]) - origin_px[1]
+    return [left, top, int(columns[-1] - columns[0]), int(rows[-1] - rows[0])]
+
+
+def _gt_entry(gt: GroundTruth) -> dict[str, Any]:
+    if not gt.has_pose:
+        return {"cam_R_m2c": [-1.0] * 9, "cam_t_m2c": [-1.0] * 3, "obj_id": gt.obj_id}
+    R, t_m = gt.T_cam_obj[:3, :3], gt.T_cam_obj[:3, 3]
+    return {"cam_R_m2c": as_list(R), "cam_t_m2c": as_list(t_m / MM), "obj_id": gt.obj_id}
+
+
+def write_camera(root: str | Path, camera: Camera, depth_scale: float = 0.1) -> None:
+    """Write the dataset's `camera.json`: the image size and the first image's intrinsics."""
+    fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    content = {"cx": cx, "cy": cy, "depth_scale": depth_scale, "fx": fx, "fy": fy}
+    write_json(Path(root) / "camera.json", content | {"width": camera.width_px, "height": camera.height_px})
+
+
+def write_models(root: str | Path, meshes: Mapping[int, Mesh], infos: Mapping[int, ModelInfo] | None = None) -> None:
+    """Write `models/obj_{id:06d}.ply` (millimetres) and `models_info.json`; symmetries come from `infos`."""
+    folder = Path(root) / "models"
+    for obj_id, mesh in meshes.items():
+        save_ply(mesh, folder / f"obj_{obj_id:06d}.ply", units="mm")
+    save_models_info(folder / "models_info.json", dict(meshes), dict(infos or {}))
+
+
+def write_targets(root: str | Path, split: str, targets: Iterable[Target]) -> None:
+    """Write the split's targets in BOP19's format."""
+    content = [
+        {"im_id": target.im_id, "inst_count": target.inst_count, "obj_id": target.obj_id, "scene_id": target.scene_id}
+        for target in sorted(targets)
+    ]
+    write_json(Path(root) / f"{split}_targets_bop19.json", content)

@@ -1,0 +1,124 @@
+"""Configuration from YAML, and whole-file writes."""
+
+import os
+import stat
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from posecore import config, files
+from posecore.errors import ConfigError, MeshError, StorageError, exit_code
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    power_w: float = 1.0
+    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        if self.power_w < 0:
+            raise ConfigError(f"power_w is {self.power_w}, expected 0 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Setup:
+    n: int
+    kind: Literal["a", "b"] = "a"
+    light: Light = field(default_factory=Light)
+    path: str | None = None
+    widths: tuple[int, ...] = (1, 2)
+
+
+def test_nested_build_and_back() -> None:
+    setup = config.build(Setup, {"n": 3, "light": {"power_w": 2, "rgb": [1, 0, 0.5]}, "widths": [4]}, "x.yaml")
+    assert setup == Setup(n=3, light=Light(power_w=2.0, rgb=(1.0, 0.0, 0.5)), widths=(4,))
+    assert config.build(Setup, config.to_dict(setup), "again") == setup
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"n": 1, "ligth": {}}, "x.yaml: unknown key ligth; known keys here: n, kind, light"),
+        ({"n": 1, "light": {"powr": 1}}, "unknown key light.powr"),
+        ({}, "the key n is missing"),
+        ({"n": "many"}, "n is 'many', expected int"),
+        ({"n": True}, "n is True, expected int"),
+        ({"n": 1, "kind": "c"}, "kind is 'c', expected one of a, b"),
+        ({"n": 1, "light": {"rgb": [1, 2]}}, r"light.rgb has 2 entries, expected 3"),
+        ({"n": 1, "light": {"power_w": -1}}, "light.power_w is -1.0, expected 0 or more"),
+        ({"n": 1, "light": 5}, "light is 5, expected a group"),
+    ],
+)
+def test_wrong_keys_and_values_are_named(mapping: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        config.build(Setup, mapping, "x.yaml")
+    assert exit_code(caught.value) == 2
+
+
+def test_overrides_are_read_as_yaml() -> None:
+    base = {"n": 1, "light": {"power_w": 1.0}}
+    found = config.apply_overrides(base, ["light.power_w=3e-1", "kind=b", "widths=[8, 9]", "path=null"])
+    assert config.build(Setup, found, "--set") == Setup(n=1, kind="b", light=Light(power_w=0.3), widths=(8, 9))
+    assert base == {"n": 1, "light": {"power_w": 1.0}}
+    for wrong in ("n", "=3", "n.x=1"):
+        with pytest.raises(ConfigError, match="--set"):
+            config.apply_overrides(base, [wrong])
+
+
+def test_merge_lays_groups_over_groups() -> None:
+    merged = config.merge({"n": 1, "light": {"power_w": 1, "rgb": [1, 1, 1]}}, {"light": {"power_w": 2}})
+    assert merged == {"n": 1, "light": {"power_w": 2, "rgb": [1, 1, 1]}}
+
+
+def test_yaml_errors_name_file_and_line(tmp_path: Path) -> None:
+    file = tmp_path / "c.yaml"
+    with pytest.raises(ConfigError, match=r"c.yaml: cannot be read"):
+        config.load_yaml(file)
+    file.write_text("a: 1\nb: [1, 2\n")
+    with pytest.raises(ConfigError, match=r"c.yaml, line 3"):
+        config.load_yaml(file)
+    file.write_text("- 1\n")
+    with pytest.raises(ConfigError, match="found a list"):
+        config.load_yaml(file)
+
+
+def test_atomic_write_replaces_and_leaves_nothing_behind(tmp_path: Path) -> None:
+    file = tmp_path / "deep/er/f"
+    files.write_atomic(file, b"one")
+    files.write_atomic(file, b"two")
+    assert file.read_bytes() == b"two"
+    assert [p.name for p in file.parent.iterdir()] == ["f"]
+    assert files.sha256_file(file) == files.sha256_bytes(b"two")
+
+
+def test_a_file_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "f").write_text("x")
+    with pytest.raises(StorageError, match="a file stands where a folder is needed"):
+        files.write_atomic(tmp_path / "f/g", b"")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_unwritable_folder_is_one_line(tmp_path: Path) -> None:
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    with pytest.raises(StorageError, match="no permission"):
+        files.write_atomic(tmp_path / "f", b"")
+
+
+def test_full_disk_is_one_line_and_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files.write_atomic(tmp_path / "f", b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(StorageError, match="disk is full"):
+        files.write_atomic(tmp_path / "f", b"new")
+    assert (tmp_path / "f").read_bytes() == b"old"
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_exit_codes() -> None:
+    assert exit_code(MeshError("x")) == 1
+    with pytest.raises(ConfigError, match="no such data specification"):
+        files.data_spec("nothing.yaml")

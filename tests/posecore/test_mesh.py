@@ -1,0 +1,107 @@
+"""Mesh files: formats, units, diameters and every kind of bad input."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from posecore.errors import MeshError
+from posecore.mesh import diameter, load_mesh, save_ply
+
+
+def write_box(path: Path, extents: tuple[float, float, float] = (60, 40, 30)) -> Path:
+    box = trimesh.creation.box(extents)
+    box.visual.vertex_colors = np.tile([10, 200, 30, 255], (len(box.vertices), 1))
+    box.export(path)
+    return path
+
+
+def test_ply_in_mm_with_vertex_colours(tmp_path: Path) -> None:
+    mesh = load_mesh(write_box(tmp_path / "box.ply"))
+    assert mesh.diameter_m == pytest.approx(np.sqrt(60**2 + 40**2 + 30**2) * 1e-3)
+    assert mesh.vertex_rgb is not None
+    np.testing.assert_array_equal(mesh.vertex_rgb[0], [10, 200, 30])
+    np.testing.assert_allclose(mesh.center_m, 0, atol=1e-9)
+
+
+def test_textured_obj_and_gltf(shared_data: Path) -> None:
+    bottle = load_mesh(shared_data / "meshes/fuze/fuze.obj", units="m")
+    assert bottle.texture_rgb is not None and bottle.uv is not None
+    assert bottle.texture_rgb.shape == (1024, 1024, 3)
+    bowl = load_mesh(shared_data / "meshes/evo_bowl/evo_bowl.gltf", units="m")
+    assert bowl.diameter_m == pytest.approx(0.1469, abs=1e-3)
+    assert bowl.vertex_rgb is not None
+
+
+def test_saved_ply_loads_the_same(tmp_path: Path) -> None:
+    mesh = load_mesh(write_box(tmp_path / "box.ply"))
+    save_ply(mesh, tmp_path / "copy.ply")
+    again = load_mesh(tmp_path / "copy.ply")
+    np.testing.assert_allclose(again.vertices_m, mesh.vertices_m, atol=1e-9)
+    np.testing.assert_array_equal(again.faces, mesh.faces)
+    np.testing.assert_array_equal(again.colours, mesh.colours)
+    np.testing.assert_allclose(again.normals, mesh.normals, atol=1e-6)
+
+
+def test_diameter_is_the_largest_vertex_distance() -> None:
+    points = np.random.default_rng(0).normal(size=(300, 3))
+    brute = np.linalg.norm(points[:, None] - points, axis=-1).max()
+    assert diameter(points) == pytest.approx(brute)
+    flat = points * [1, 1, 0]
+    assert diameter(flat) == pytest.approx(np.linalg.norm(flat[:, None] - flat, axis=-1).max())
+
+
+def test_metres_read_as_mm_are_refused_with_the_hint(tmp_path: Path) -> None:
+    file = write_box(tmp_path / "box.ply", (0.06, 0.04, 0.03))
+    with pytest.raises(MeshError, match=r"box.ply: the diameter is 0.0781.* mm when read in mm.*--units m\?"):
+        load_mesh(file)
+    assert load_mesh(file, units="m").diameter_m == pytest.approx(0.0781, abs=1e-4)
+
+
+def test_mm_read_as_metres_are_refused_with_the_hint(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"--units (cm|mm)"):
+        load_mesh(write_box(tmp_path / "box.ply"), units="m")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("gone.ply", None, "no such mesh file"),
+        ("empty.ply", b"", "empty"),
+        ("noise.ply", b"\x00\x01garbage", "cannot be read as a mesh"),
+        ("mesh.xyz123", b"hello", "cannot be read as a mesh"),
+        (
+            "points.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+            b"end_header\n0 0 0\n1 1 1\n",
+            "no faces",
+        ),
+        (
+            "nan.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+            b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\nnan 1 1\n0 50 0\n3 0 1 2\n",
+            "vertex 1 is",
+        ),
+    ],
+)
+def test_bad_files_give_one_line_that_names_them(
+    tmp_path: Path, name: str, content: bytes | None, message: str
+) -> None:
+    file = tmp_path / name
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(MeshError, match=message) as caught:
+        load_mesh(file)
+    assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_missing_texture_is_an_error_not_grey(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 50 0 0\nv 0 50 9\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
+    )
+    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd skin.png\n")
+    with pytest.raises(MeshError, match=r"texture .*skin.png is missing"):
+        load_mesh(tmp_path / "a.obj")
+    (tmp_path / "a.mtl").unlink()
+    with pytest.raises(MeshError, match=r"material file .*a.mtl is missing"):
+        load_mesh(tmp_path / "a.obj")

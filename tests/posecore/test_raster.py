@@ -1,0 +1,165 @@
+"""The GL rasteriser against its numpy twin, known corners, and its own repetition."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import trimesh
+from posecore import camera, raster_reference, se3
+from posecore.errors import RenderError
+from posecore.mesh import Mesh
+from posecore.raster import DirectionalLight, Instance, Rasteriser, Shading
+from scipy.spatial import ConvexHull
+
+K = camera.intrinsics(310.0, 285.0, 70.3, 50.8)
+
+
+def mesh_of(shape: trimesh.Trimesh, rgb: tuple[int, int, int] = (200, 40, 90)) -> Mesh:
+    return Mesh(
+        vertices_m=np.asarray(shape.vertices, np.float64),
+        faces=np.asarray(shape.faces, np.int32),
+        normals=np.asarray(shape.vertex_normals, np.float32),
+        vertex_rgb=np.tile(np.array(rgb, np.uint8), (len(shape.vertices), 1)),
+    )
+
+
+BOX = mesh_of(trimesh.creation.box((0.11, 0.07, 0.05)))
+RING = mesh_of(trimesh.creation.torus(0.05, 0.015, major_sections=24, minor_sections=12))
+
+
+@pytest.fixture(scope="module")
+def rasteriser() -> Iterator[Rasteriser]:
+    with Rasteriser({1: BOX, 2: RING}) as r:
+        yield r
+
+
+def poses(n: int, z_m: float = 0.4, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack([
+        se3.make_T(se3.random_rotation(rng), np.array([rng.uniform(-0.04, 0.04), rng.uniform(-0.03, 0.03), z_m]))
+        for _ in range(n)
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize(("obj_id", "mesh"), [(1, BOX), (2, RING)])
+def test_mask_and_depth_equal_the_numpy_twin(rasteriser: Rasteriser, obj_id: int, mesh: Mesh) -> None:
+    T = poses(10, seed=obj_id)
+    layers = rasteriser.render(obj_id, K, T, 140, 100)
+    for i in range(len(T)):
+        depth_m, mask = raster_reference.render(mesh, K, T[i], 140, 100)
+        assert (mask != layers.mask[i]).sum() <= 1  # a pixel centre may lie on an edge within float32
+        both = mask & layers.mask[i]
+        assert np.median(np.abs(depth_m - layers.depth_m[i])[both]) < 1e-6
+        assert (np.abs(depth_m - layers.depth_m[i])[both] < 1e-5).mean() > 0.998
+
+
+def test_mask_is_the_hull_of_the_projected_corners(rasteriser: Rasteriser) -> None:
+    """A box's silhouette is a convex polygon: every pixel centre inside it is drawn, every one outside is not."""
+    centres = np.stack(np.meshgrid(np.arange(140) + 0.5, np.arange(100) + 0.5), axis=-1)
+    for T in poses(20, seed=5):
+        mask = rasteriser.render(1, K, T[None], 140, 100).mask[0]
+        hull = ConvexHull(camera.project(K, se3.apply(T, BOX.vertices_m)))
+        outside_px = (centres @ hull.equations[:, :2].T + hull.equations[:, 2]).max(axis=-1)  # signed, per hull edge
+        clear = np.abs(outside_px) > 0.01
+        np.testing.assert_array_equal(mask[clear], outside_px[clear] < 0)
+
+
+def test_batch_with_one_K_per_pose_equals_single_renders(rasteriser: Rasteriser) -> None:
+    T, rng = poses(7), np.random.default_rng(3)
+    Ks = np.stack([camera.intrinsics(*rng.uniform(200, 300, 2), *rng.uniform(25, 40, 2)) for _ in T])
+    batch = rasteriser.render(2, Ks, T, 64, 64)
+    for i in range(len(T)):
+        single = rasteriser.render(2, Ks[i], T[i : i + 1], 64, 64)
+        # a tile's place in the atlas moves the last bits of interpolated values
+        assert (batch.mask[i] != single.mask[0]).sum() <= 1
+        both = batch.mask[i] & single.mask[0]
+        np.testing.assert_allclose(batch.depth_m[i][both], single.depth_m[0][both], atol=2e-6)
+        assert batch.rgb is not None and single.rgb is not None
+        assert np.abs(batch.rgb[i][both].astype(int) - single.rgb[0][both]).max() <= 1
+
+
+def test_a_batch_larger_than_one_atlas_is_complete(rasteriser: Rasteriser) -> None:
+    T = np.repeat(poses(1), 9, axis=0)
+    layers = rasteriser.render(1, camera.intrinsics(1500, 1500, 512, 512), T, 1024, 1024, rgb=False)
+    assert (layers.mask.reshape(9, -1).sum(axis=1) == layers.mask[0].sum()).all()
+
+
+def test_two_rasterisers_in_one_process_do_not_disturb_each_other(rasteriser: Rasteriser) -> None:
+    T = poses(1)
+    before = rasteriser.render(1, K, T, 140, 100).depth_m
+    with Rasteriser({1: RING}) as other:
+        assert other.render(1, K, T, 140, 100).mask.any()
+    np.testing.assert_array_equal(rasteriser.render(1, K, T, 140, 100).depth_m, before)
+
+
+def test_scene_keeps_the_nearest_instance(rasteriser: Rasteriser) -> None:
+    near, far = np.eye(4), np.eye(4)
+    near[:3, 3], far[:3, 3] = [0.0, 0.0, 0.4], [0.0, 0.0, 0.6]
+    layers = rasteriser.render_scene(
+        [Instance(obj_id=1, T_cam_obj=far), Instance(obj_id=2, T_cam_obj=near)], K, 140, 100
+    )
+    alone = rasteriser.render(2, K, near[None], 140, 100)
+    np.testing.assert_array_equal(layers.instance == 1, alone.mask[0])
+    assert set(np.unique(layers.instance)) == {-1, 0, 1}
+    assert (layers.depth_m[layers.instance == -1] == 0).all()
+
+
+def test_textures_are_upright_and_not_mirrored() -> None:
+    """A quad with a four-colour texture, facing the camera: image and texture agree corner by corner."""
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[:32, :32], texture[:32, 32:], texture[32:, :32], texture[32:, 32:] = (
+        (250, 0, 0), (0, 250, 0), (0, 0, 250), (250, 250, 0),
+    )  # fmt: skip
+    quad = Mesh(
+        vertices_m=np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]]),
+        faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        normals=np.tile(np.array([0, 0, -1], np.float32), (4, 1)),
+        uv=np.array([[0, 1], [1, 1], [1, 0], [0, 0]], np.float32),  # v points up, camera y points down
+        texture_rgb=texture,
+    )
+    T = np.eye(4)
+    T[2, 3] = 0.5
+    with Rasteriser({1: quad}) as r:
+        rgb = r.render(
+            1, camera.intrinsics(100, 100, 32, 32), T[None], 64, 64, shading=Shading(ambient=1, diffuse=0)
+        ).rgb
+    assert rgb is not None
+    for (u, v), wanted in {(18, 18): (250, 0, 0), (46, 18): (0, 250, 0), (18, 46): (0, 0, 250)}.items():
+        np.testing.assert_allclose(rgb[0, v, u], wanted, atol=3)
+
+
+def test_light_from_the_right_brightens_the_right_side() -> None:
+    ball = mesh_of(trimesh.creation.icosphere(3, 0.05), rgb=(200, 200, 200))
+    T = np.eye(4)
+    T[2, 3] = 0.4
+    light = Shading(ambient=0.1, diffuse=0.9, lights=(DirectionalLight(direction_cam=(1.0, 0.0, 0.0)),))
+    with Rasteriser({1: ball}) as r:
+        rgb = r.render(1, K, T[None], 140, 100, shading=light).rgb
+    assert rgb is not None
+    grey = rgb[0].astype(float).mean(axis=-1)
+    assert grey[50, 70 + 25] > 3 * grey[50, 70 - 25]
+
+
+def test_object_behind_the_camera_is_not_drawn(rasteriser: Rasteriser) -> None:
+    T = poses(1)
+    T[0, 2, 3] = -0.4
+    assert not rasteriser.render(1, K, T, 140, 100).mask.any()
+
+
+def test_object_through_the_camera_plane_is_clipped_not_mirrored(rasteriser: Rasteriser) -> None:
+    T = np.eye(4)
+    T[2, 3] = 0.02
+    depth_m = rasteriser.render(1, K, T[None], 140, 100).depth_m
+    assert depth_m.max() <= 0.05 and (depth_m >= 0).all()
+
+
+def test_same_input_twice_gives_the_same_bytes(rasteriser: Rasteriser) -> None:
+    T = poses(6)
+    first, second = rasteriser.render(2, K, T, 140, 100), rasteriser.render(2, K, T, 140, 100)
+    np.testing.assert_array_equal(first.depth_m, second.depth_m)
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+
+
+def test_unknown_object_is_an_error(rasteriser: Rasteriser) -> None:
+    with pytest.raises(RenderError, match="object 9 has no mesh"):
+        rasteriser.render(9, K, poses(1), 32, 32)

@@ -1,0 +1,144 @@
+"""Shard datasets: round trip within the stated quantisation, commits, damage and foreign data."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from posecore import shard
+from posecore.errors import ShardError, StorageError
+
+CARD = {"n": 10, "shard_size": 4, "patch_px": 16, "contour_points": 5, "seed": 3}
+
+
+def samples(count: int, seed: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    values = {}
+    for field in shard.field_table():
+        shape = (count, *field.size(16, 5))
+        if field.scale is None and not field.dtype.startswith("float"):
+            values[field.name] = rng.integers(0, 200, shape).astype(field.dtype)
+        else:
+            values[field.name] = rng.uniform(0, 5, shape)
+    return values
+
+
+def write(url: str, order: tuple[int, ...] = (0, 1, 2)) -> None:
+    writer = shard.ShardWriter.create(url, CARD)
+    for i in order:
+        writer.commit(writer.encode(i, samples(shard.samples_in(CARD, i), i)))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("kind", ["local", "memory"])
+def test_round_trip_within_half_a_step(tmp_path: Path, kind: str) -> None:
+    url = str(tmp_path / "d") if kind == "local" else f"memory://{tmp_path.name}"
+    write(url)
+    reader = shard.ShardReader(url)
+    assert reader.complete and reader.n_samples(2) == 2
+    for i in range(3):
+        wanted, found = samples(shard.samples_in(CARD, i), i), reader.read(i)
+        for field in shard.field_table():
+            step = field.scale / 2 + 1e-6 if field.scale else 0
+            got = wanted[field.name].astype(field.dtype) if field.scale is None else wanted[field.name]
+            np.testing.assert_allclose(found[field.name], got, atol=step, rtol=0 if field.scale is None else 1e-6)
+
+
+def test_any_zarr_reader_opens_it(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"))
+    group = zarr.open_group(tmp_path / "d", mode="r")
+    assert group.attrs["schema"] == "posepair"
+    assert group["scene_rgb"].shape == (10, 16, 16, 3)
+    np.testing.assert_array_equal(group["T_cam_obj"][4:8], samples(4, 1)["T_cam_obj"])
+    assert group["scene_rgb"].shards == (4, 16, 16, 3)
+
+
+def test_bytes_do_not_depend_on_the_order_of_commits(tmp_path: Path) -> None:
+    write(str(tmp_path / "a"), (0, 1, 2))
+    write(str(tmp_path / "b"), (2, 0, 1))
+    assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_reopening_the_same_dataset_keeps_what_is_there(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"), (1,))
+    before = contents(tmp_path / "d")
+    assert shard.ShardWriter.create(str(tmp_path / "d"), CARD).committed() == [1]
+    assert contents(tmp_path / "d") == before
+
+
+def test_what_a_killed_writer_left_does_not_count(tmp_path: Path) -> None:
+    """Shard files without a manifest line, and temporary files, are not part of the dataset."""
+    write(str(tmp_path / "d"), (0,))
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
+    encoded = writer.encode(1, samples(4, 1))
+    (tmp_path / "d/scene_rgb/c/1/0/0").mkdir(parents=True)
+    (tmp_path / "d/scene_rgb/c/1/0/0/0").write_bytes(encoded.files["scene_rgb"][:100])
+    (tmp_path / "d/.manifest.jsonl.77.tmp").write_bytes(b"{")
+    assert shard.ShardReader(str(tmp_path / "d")).committed == [0]
+    writer.commit(encoded)
+    np.testing.assert_array_equal(shard.ShardReader(str(tmp_path / "d")).read(1)["K"], samples(4, 1)["K"])
+
+
+def test_another_dataset_is_refused_by_its_first_difference(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"), (0,))
+    with pytest.raises(ShardError, match="seed is 3 there and 4 here"):
+        shard.ShardWriter.create(str(tmp_path / "d"), {**CARD, "seed": 4})
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/thesis.docx").write_text("precious")
+    with pytest.raises(ShardError, match="not empty"):
+        shard.ShardWriter.create(str(tmp_path / "other"), CARD)
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StorageError, match="expected a folder"):
+        shard.ShardWriter.create(str(tmp_path / "file"), CARD)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing", "flipped"])
+def test_damage_is_named_by_file(tmp_path: Path, damage: str) -> None:
+    write(str(tmp_path / "d"))
+    file = tmp_path / "d/scene_rgb/c/1/0/0/0"
+    data = file.read_bytes()
+    if damage == "truncated":
+        file.write_bytes(data[: len(data) // 2])
+    elif damage == "missing":
+        file.unlink()
+    else:
+        file.write_bytes(bytes([data[0] ^ 255, *data[1:-1], data[-1] ^ 255]))
+    with pytest.raises(ShardError, match=r"scene_rgb/c/1/0/0/0.*(expected|decode)"):
+        shard.ShardReader(str(tmp_path / "d")).read(1)
+    shard.ShardReader(str(tmp_path / "d")).read(0)
+
+
+def test_another_schema_version_is_refused(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"))
+    group = json.loads((tmp_path / "d/zarr.json").read_text())
+    group["attributes"]["schema_version"] = 99
+    (tmp_path / "d/zarr.json").write_text(json.dumps(group))
+    with pytest.raises(ShardError, match="version 99, expected posepair version 1"):
+        shard.ShardReader(str(tmp_path / "d"))
+
+
+def test_no_dataset_and_broken_manifest(tmp_path: Path) -> None:
+    with pytest.raises(ShardError, match="no shard dataset"):
+        shard.ShardReader(str(tmp_path))
+    write(str(tmp_path / "d"))
+    with (tmp_path / "d/manifest.jsonl").open("a") as stream:
+        stream.write("{oops\n")
+    with pytest.raises(ShardError, match=r"manifest.jsonl, line 4"):
+        shard.ShardReader(str(tmp_path / "d"))
+
+
+def test_values_out_of_range_and_missing_fields_are_refused(tmp_path: Path) -> None:
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
+    arrays = samples(4, 0)
+    with pytest.raises(ShardError, match="scene_depth_m: values from"):
+        writer.encode(0, {**arrays, "scene_depth_m": np.full((4, 16, 16), 7.0)})
+    with pytest.raises(ShardError, match="hypothesis_depth_m: values from nan"):
+        writer.encode(0, {**arrays, "hypothesis_depth_m": np.full((4, 16, 16), np.nan)})
+    with pytest.raises(ShardError, match="K_crop: found nothing"):
+        writer.encode(0, {k: v for k, v in arrays.items() if k != "K_crop"})
+    with pytest.raises(ShardError, match="obj_id: found"):
+        writer.encode(0, {**arrays, "obj_id": np.zeros(3, np.int32)})
