@@ -87,8 +87,9 @@ def test_a_batch_larger_than_one_atlas_is_complete(rasteriser: Rasteriser) -> No
 def test_two_rasterisers_in_one_process_do_not_disturb_each_other(rasteriser: Rasteriser) -> None:
     T = poses(1)
     before = rasteriser.render(1, K, T, 140, 100).depth_m
-    with Rasteriser({1: RING}) as other:
-        assert other.render(1, K, T, 140, 100).mask.any()
+    for _ in range(2):  # also one made after another was closed
+        with Rasteriser({1: RING}) as other:
+            assert other.render(1, K, T, 140, 100).mask.any()
     np.testing.assert_array_equal(rasteriser.render(1, K, T, 140, 100).depth_m, before)
 
 
@@ -138,6 +139,28 @@ def test_light_from_the_right_brightens_the_right_side() -> None:
     assert rgb is not None
     grey = rgb[0].astype(float).mean(axis=-1)
     assert grey[50, 70 + 25] > 3 * grey[50, 70 - 25]
+
+
+def test_leaving_out_back_faces_changes_nothing(rasteriser: Rasteriser) -> None:
+    assert RING.is_closed
+    open_twin = mesh_of(trimesh.creation.torus(0.05, 0.015, major_sections=24, minor_sections=12))
+    open_twin.__dict__["is_closed"] = False
+    T = poses(10, z_m=0.5)
+    closed = rasteriser.render(2, K, T, 140, 100)
+    with Rasteriser({2: open_twin}) as other:
+        full = other.render(2, K, T, 140, 100)
+    np.testing.assert_array_equal(closed.mask, full.mask)
+    # on the rim a front and a back face may tie within the depth buffer's resolution
+    assert (np.abs(closed.depth_m - full.depth_m) > 1e-6).sum() <= 5
+
+
+def test_open_and_inverted_meshes_are_drawn_from_both_sides(rasteriser: Rasteriser) -> None:
+    open_box = Mesh(vertices_m=BOX.vertices_m, faces=BOX.faces[:-2], normals=BOX.normals)
+    inverted = Mesh(vertices_m=BOX.vertices_m, faces=BOX.faces[:, ::-1].copy(), normals=BOX.normals)
+    assert BOX.is_closed and not open_box.is_closed and not inverted.is_closed
+    T = poses(5)
+    with Rasteriser({1: inverted}) as other:
+        np.testing.assert_array_equal(other.render(1, K, T, 140, 100).mask, rasteriser.render(1, K, T, 140, 100).mask)
 
 
 def test_object_behind_the_camera_is_not_drawn(rasteriser: Rasteriser) -> None:

@@ -9,6 +9,8 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 
@@ -66,6 +68,27 @@ class Mesh:
             row = np.floor((1.0 - self.uv[:, 1] % 1.0) * h).astype(int).clip(0, h - 1)
             return np.asarray(self.texture_rgb[row, column])
         return np.full((len(self.vertices_m), 3), 160, np.uint8)
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Whether the surface is closed and turned outwards, so that no back face is ever seen from outside.
+
+        Vertices at one place count as one. Every directed edge must have its opposite, and every connected piece must
+        enclose a positive volume.
+        """
+        _, place = np.unique(self.vertices_m.round(9), axis=0, return_inverse=True)
+        faces = place.reshape(-1)[self.faces]
+        proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+        faces, corners_m = faces[proper], self.vertices_m[self.faces[proper]]
+        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+        n = int(place.max()) + 1
+        if not np.array_equal(np.sort(edges @ [n, 1]), np.sort(edges @ [1, n])):
+            return False
+        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+        _, piece = connected_components(links, directed=False)
+        volumes = np.einsum("fi,fi->f", corners_m[:, 0], np.cross(corners_m[:, 1], corners_m[:, 2])) / 6.0
+        of_piece = np.bincount(piece[faces[:, 0]], weights=volumes)
+        return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
 
 
 def diameter(points_m: Float[Array, "v 3"]) -> float:

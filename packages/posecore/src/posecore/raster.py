@@ -5,6 +5,7 @@ engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mas
 `raster_reference` is the plain twin that tests hold this against.
 """
 
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
@@ -135,6 +136,31 @@ class SceneLayers:
     instance: Int[Array, "h w"]
 
 
+_threads = threading.local()
+
+
+def _thread_context() -> Any:
+    """The GL context of this thread, made once and never released.
+
+    Releasing one ends EGL for the whole process, and contexts made after that draw nothing, without an error.
+    """
+    if not hasattr(_threads, "context"):
+        settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
+        try:
+            context: Any = moderngl.create_context(**settings)
+        except Exception as error:  # moderngl raises bare exceptions from several layers
+            reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
+            raise RenderError(
+                f"no EGL device for the rasteriser ({reason}); "
+                "install a GPU driver with EGL, or Mesa's software renderer (Debian: libegl1 libgl1-mesa-dri)"
+            ) from error
+        context.gc_mode = "auto"
+        context.enable(moderngl.DEPTH_TEST)
+        context.front_face = "cw"  # image rows run downwards, which turns counter-clockwise faces around
+        _threads.context = context
+    return _threads.context
+
+
 class Rasteriser:
     """Draws meshes at poses. One per process and thread; a context manager.
 
@@ -147,22 +173,12 @@ class Rasteriser:
 
     def __init__(self, meshes: Mapping[int, Mesh]) -> None:
         self._meshes = dict(meshes)
-        try:
-            settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
-            self._context: Any = moderngl.create_context(**settings)
-        except Exception as error:  # moderngl raises bare exceptions from several layers
-            reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
-            raise RenderError(
-                f"no EGL device for the rasteriser ({reason}); "
-                "install a GPU driver with EGL, or Mesa's software renderer (Debian: libegl1 libgl1-mesa-dri)"
-            ) from error
-        self._context.gc_mode = "auto"
+        self._context = _thread_context()
         self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
         self._arrays: dict[int, moderngl.VertexArray] = {}
         self._textures: dict[int, moderngl.Texture] = {}
         self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
         self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
-        self._context.enable(moderngl.DEPTH_TEST)
 
     def __enter__(self) -> "Rasteriser":
         return self
@@ -188,10 +204,13 @@ class Rasteriser:
         self._meshes[obj_id] = mesh
 
     def close(self) -> None:
-        """Free the GL context and everything in it."""
+        """Free everything that was uploaded."""
+        self._context.__enter__()
         for obj_id in list(self._arrays):
             self._release(obj_id)
-        self._context.release()
+        for target in self._targets.values():
+            self._free(target)
+        self._targets.clear()
 
     def render(
         self,
@@ -215,7 +234,7 @@ class Rasteriser:
             rgb: Whether colours are read back.
             shading: Lights.
         """
-        self._context.__enter__()  # contexts share one "current" per thread; another Rasteriser may have taken it
+        self._context.__enter__()  # Blender, in the same process, makes a context of its own the current one
         n = len(T_cam_obj)
         K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
@@ -295,6 +314,11 @@ class Rasteriser:
         T = np.asarray(instance.T_cam_obj, np.float64)
         if float(T[2, :3] @ mesh.center_m + T[2, 3]) + mesh.diameter_m <= near_m:
             return
+        # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
+        if mesh.is_closed and float(T[2, 3]) - 2 * mesh.diameter_m > near_m:
+            self._context.enable(moderngl.CULL_FACE)
+        else:
+            self._context.disable(moderngl.CULL_FACE)
         clip = _clip_from_cam(K, width_px, height_px, near_m, far_m=100.0)
         program = self._program
         program["clip_from_cam"].write(clip.T.astype("f4").tobytes())

@@ -78,11 +78,11 @@ class BopWriter:
         self,
         im_id: int,
         rgb: UInt8[Array, "h w 3"],
-        depth_m: Float[Array, "h w"] | None,
+        depth_m: Float[Array, "dh dw"] | None,
         camera: Camera,
         gts: Sequence[GroundTruth],
         masks: Sequence[Bool[Array, "mh mw"]],
-        masks_visib: Sequence[Bool[Array, "h w"]],
+        masks_visib: Sequence[Bool[Array, "vh vw"]],
         *,
         mask_origin_px: tuple[int, int] = (0, 0),
     ) -> None:
@@ -107,7 +107,13 @@ class BopWriter:
         if len(gts) != len(masks) or len(gts) != len(masks_visib):
             raise DatasetError(f"{where}: {len(gts)} objects, {len(masks)} masks, {len(masks_visib)} visible masks")
         if size != (camera.height_px, camera.width_px):
-            raise DatasetError(f"{where}: the image is {size[1]} x {size[0]}, the camera says otherwise")
+            raise DatasetError(
+                f"{where}: the image is {size[1]} x {size[0]}, the camera {camera.width_px} x {camera.height_px}"
+            )
+        if depth_m is not None and depth_m.shape != size:
+            raise DatasetError(
+                f"{where}: the image is {size[1]} x {size[0]}, depth {depth_m.shape[1]} x {depth_m.shape[0]}"
+            )
         column, row = mask_origin_px
         cropped = [mask[row : row + size[0], column : column + size[1]] for mask in masks]
         if any(mask.shape != size for mask in [*cropped, *masks_visib]):
