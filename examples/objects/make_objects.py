@@ -7,12 +7,13 @@ changes, so that vertex colours and vertex normals stay crisp. Nothing here is r
 """
 
 import json
-import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
+from posecore.mesh import Mesh, save_ply
 
 Array = np.ndarray
 Rgb = tuple[int, int, int]
@@ -65,7 +66,7 @@ def part_from_grids(grids: Sequence[tuple[Array, Paint]]) -> Part:
     return Part(corners_mm=corners_mm, rgb=np.array(colours, dtype=np.uint8))
 
 
-def box(cuts_x: Sequence[float], cuts_y: Sequence[float], cuts_z: Sequence[float], paint: Paint) -> Part:
+def box(cuts_x: ArrayLike, cuts_y: ArrayLike, cuts_z: ArrayLike, paint: Paint) -> Part:
     """Build a box whose sides are cut at the given coordinates (mm), so that windows can have their own colour."""
     cuts = [np.asarray(c, dtype=np.float64) for c in (cuts_x, cuts_y, cuts_z)]
     grids = []
@@ -123,7 +124,9 @@ HULL_ROWS = 8
 def hull_section(u: float) -> Array:
     """Return one closed cross-section of the hull (m, 3) at u in [0, 1] from stern to bow, from port edge downwards."""
     x = -52.0 + 108.0 * u + 2.0 * u
-    half_beam = 22.0 * max(0.02, 1 - (abs(u - 0.45) / 0.55) ** 2.4) if u > 0.45 else 22.0 - 6.0 * ((0.45 - u) / 0.45) ** 2
+    half_beam = (
+        22.0 * max(0.02, 1 - (abs(u - 0.45) / 0.55) ** 2.4) if u > 0.45 else 22.0 - 6.0 * ((0.45 - u) / 0.45) ** 2
+    )
     top = 13.0 + 11.0 * max(0.0, (u - 0.4) / 0.6) ** 2 + 2.5 * max(0.0, (0.4 - u) / 0.4) ** 2
     bottom = -15.0 + 16.0 * max(0.0, (u - 0.65) / 0.35) ** 2 + 8.0 * max(0.0, (0.25 - u) / 0.25) ** 2
     t = np.linspace(0.0, np.pi / 2, HULL_ROWS + 1)
@@ -134,7 +137,7 @@ def hull_section(u: float) -> Array:
     inner = half_beam * 0.9
     deck = np.array([[-inner, top], [-inner, top - wall], [0, top - wall], [inner, top - wall], [inner, top]])
     ring = np.concatenate([np.c_[y, z], np.c_[-y, z][-2::-1], deck, [[half_beam, top]]])
-    return np.c_[np.full(len(ring), x), ring]
+    return np.column_stack([np.full(len(ring), x), ring])
 
 
 def paint_hull(centre: Array, station: int, column: int) -> Rgb:
@@ -216,9 +219,7 @@ def tug_parts() -> list[Part]:
         [(0, -7), (4.8, -7), (4.8, -5), (3, -5), (3, 5), (4.8, 5), (4.8, 7), (0, 7)], 16, solid_paint(MAGENTA)
     )
     bollard = revolved([(0, 0), (2.4, 0), (2.4, 6), (3.4, 7), (3.4, 9), (0, 9)], 14, solid_paint(RED))
-    rudder = box(
-        [-55, -51, -47], [-1.2, 1.2], [-13, -6, 2], lambda c, _r, _k: LIME if c[2] < -6 else RED
-    )
+    rudder = box([-55, -51, -47], [-1.2, 1.2], [-13, -6, 2], lambda c, _r, _k: LIME if c[2] < -6 else RED)
     return [
         tug_hull(),
         house,
@@ -260,11 +261,11 @@ def bobbin_parts() -> list[Part]:
     return [revolved(profile, 64, lambda _c, row, _k: colours[row])]
 
 
-# ---------------------------------------------------------------- parts -> vertices
+# ---------------------------------------------------------------- parts -> mesh
 
 
 def corner_normals(part: Part) -> Array:
-    """Return a normal for each triangle corner (f, 3, 3): the area-weighted mean over the faces on its side of a crease."""
+    """Return a normal for each triangle corner (f, 3, 3): area-weighted over its side of a crease."""
     corners = part.corners_mm
     weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     unit = weighted / np.linalg.norm(weighted, axis=1, keepdims=True)
@@ -280,49 +281,40 @@ def corner_normals(part: Part) -> Array:
             around = np.array(faces_at[int(vertex)])
             near = around[unit[around] @ unit[face] > np.cos(CREASE_RAD)]
             normals[face, k] = weighted[near].sum(axis=0)
-    return normals / np.linalg.norm(normals, axis=2, keepdims=True)
+    return np.asarray(normals / np.linalg.norm(normals, axis=2, keepdims=True))
 
 
-def write_ply(parts: Sequence[Part], path: Path) -> None:
-    """Write parts as one binary PLY in mm, origin at the centre of the bounding box, with normals and colours."""
+def mesh_of(parts: Sequence[Part]) -> Mesh:
+    """Join parts into one mesh with its origin at the centre of the bounding box."""
     corners = np.concatenate([part.corners_mm for part in parts]).reshape(-1, 3)
     corners = corners - (corners.min(axis=0) + corners.max(axis=0)) / 2
-    row = np.dtype([("p", "<f4", 3), ("n", "<f4", 3), ("c", "u1", 3)])
-    rows = np.empty(len(corners), dtype=row)
-    rows["p"] = np.round(corners, 4)
-    rows["n"] = np.round(np.concatenate([corner_normals(part) for part in parts]).reshape(-1, 3), 4)
-    rows["c"] = np.concatenate([part.rgb for part in parts]).repeat(3, axis=0)
-    rows["p"] += 0.0  # -0.0 and 0.0 are the same corner
-    rows["n"] += 0.0
-    _, first, index = np.unique(rows.view(np.dtype((np.void, row.itemsize))), return_index=True, return_inverse=True)
-    faces = index.reshape(-1, 3)
-    names = [*(f"property float {n}" for n in ("x", "y", "z", "nx", "ny", "nz"))]
-    names += [f"property uchar {n}" for n in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(first)}", *names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    body = b"".join(struct.pack("<B3i", 3, *face) for face in faces.tolist())
-    path.write_bytes("\n".join(header).encode() + rows[first].tobytes() + body)
+    normals = np.concatenate([corner_normals(part) for part in parts]).reshape(-1, 3)
+    rgb = np.concatenate([part.rgb for part in parts]).repeat(3, axis=0)
+    # Rounded, and with one kind of zero, so that corners that agree in place, normal and colour become one vertex.
+    rows = np.round(np.concatenate([corners, normals, rgb], axis=1), 4) + 0.0
+    vertices, index = np.unique(rows, axis=0, return_inverse=True)
+    return Mesh(
+        vertices_m=vertices[:, :3] * 1e-3,
+        faces=index.reshape(-1, 3).astype(np.int32),
+        normals=vertices[:, 3:6].astype(np.float32),
+        vertex_rgb=vertices[:, 6:].astype(np.uint8),
+    )
 
 
-def models_info(parts: Sequence[Part]) -> dict[str, float]:
+def models_info(mesh: Mesh) -> dict[str, float]:
     """Return BOP's size entries of `models_info.json`, in mm."""
-    points = np.unique(np.round(np.concatenate([part.corners_mm for part in parts]).reshape(-1, 3), 4), axis=0)
-    size = np.ptp(points, axis=0)
-    diameter = max(float(np.linalg.norm(points - point, axis=1).max()) for point in points)
-    info = {"diameter": round(diameter, 4)}
-    for axis, name in enumerate("xyz"):
-        info[f"min_{name}"] = round(float(-size[axis] / 2), 4)
-    for axis, name in enumerate("xyz"):
-        info[f"size_{name}"] = round(float(size[axis]), 4)
-    return info
+    lowest, size = mesh.vertices_m.min(axis=0) * 1e3, np.ptp(mesh.vertices_m, axis=0) * 1e3
+    info = {"diameter": round(mesh.diameter_m * 1e3, 4)}
+    info |= {f"min_{name}": round(float(lowest[axis]), 4) for axis, name in enumerate("xyz")}
+    return info | {f"size_{name}": round(float(size[axis]), 4) for axis, name in enumerate("xyz")}
 
 
 def main() -> None:
     """Write both objects and their sizes and symmetries beside this file."""
     folder = Path(__file__).parent
-    tug, bobbin = tug_parts(), bobbin_parts()
-    write_ply(tug, folder / "tug.ply")
-    write_ply(bobbin, folder / "bobbin.ply")
+    tug, bobbin = mesh_of(tug_parts()), mesh_of(bobbin_parts())
+    save_ply(tug, folder / "tug.ply")
+    save_ply(bobbin, folder / "bobbin.ply")
     about_z = {"symmetries_continuous": [{"axis": [0, 0, 1], "offset": [0, 0, 0]}]}
     info = {"tug": models_info(tug), "bobbin": models_info(bobbin) | about_z}
     (folder / "models_info.json").write_text(json.dumps(info, indent=2) + "\n", encoding="utf-8")

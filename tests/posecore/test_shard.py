@@ -48,6 +48,16 @@ def test_round_trip_within_half_a_step(tmp_path: Path, kind: str) -> None:
             np.testing.assert_allclose(found[field.name], got, atol=step, rtol=0 if field.scale is None else 1e-6)
 
 
+def test_fields_that_are_all_zero_come_back_as_zero(tmp_path: Path) -> None:
+    zeros = {f.name: np.zeros((4, *f.size(16, 5))) for f in shard.field_table()}
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
+    writer.commit(writer.encode(0, {**zeros, "scene_rgb": samples(4, 0)["scene_rgb"]}))
+    found = shard.ShardReader(str(tmp_path / "d")).read(0)
+    np.testing.assert_array_equal(found["scene_rgb"], samples(4, 0)["scene_rgb"])
+    assert all(not values.any() for name, values in found.items() if name != "scene_rgb")
+    np.testing.assert_array_equal(zarr.open_group(tmp_path / "d", mode="r")["scene_mask"][:4], 0)
+
+
 def test_any_zarr_reader_opens_it(tmp_path: Path) -> None:
     write(str(tmp_path / "d"))
     group = zarr.open_group(tmp_path / "d", mode="r")

@@ -28,7 +28,10 @@ def distance_transform_px(contour: Bool[Array, "h w"]) -> Float[Array, "h w"]:
     """
     if not contour.any():
         raise RenderError("the silhouette has no contour inside the patch, so it has no distance transform")
-    return np.asarray(cv2.distanceTransform((~contour).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE))
+    approximate = cv2.distanceTransform((~contour).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # cv2's last bit depends on how its buffers lie in memory. Squared distances between pixel centres are whole
+    # numbers, so rounding them makes the root exact, and the same at every call.
+    return np.asarray(np.sqrt(np.rint(np.square(approximate))))
 
 
 def trace(mask: Bool[Array, "h w"]) -> Int[Array, "n 2"]:

@@ -92,7 +92,7 @@ def schema() -> tuple[str, int]:
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
-    """A shard ready to be written: file bytes by field, and its line of the manifest."""
+    """A shard ready to be written: file bytes by field (none for a field that is all zero), and its manifest line."""
 
     shard_id: int
     files: dict[str, bytes]
@@ -247,11 +247,13 @@ class ShardReader:
         expected = self._lines[shard_id]["bytes"]
         for name in wanted:
             key = _shard_key(name, shard_id, self.card)
+            if expected.get(name) == 0:  # all zero, which Zarr stores as no file
+                continue
             data = self._store.get(key)
             found = "no file" if data is None else f"{len(data)} bytes"
-            if data is None or len(data) != expected[name]:
+            if data is None or len(data) != expected.get(name):
                 raise ShardError(
-                    f"{self.url}/{key}: found {found}, expected {expected[name]} bytes; the shard is damaged: "
+                    f"{self.url}/{key}: found {found}, expected {expected.get(name)} bytes; the shard is damaged: "
                     f"delete its line (shard {shard_id}) from {MANIFEST} and run the same `synthgen render` again"
                 )
             _put(scratch, _shard_key(name, 0, self.card), data)
@@ -284,7 +286,8 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
             raise ShardError(f"shard {shard_id}, {field.name}: found {found}, expected shape {shape}")
         group[field.name][:count] = field.encode(arrays[field.name])
     contents = _contents(scratch)
-    files = {f.name: contents[_shard_key(f.name, 0, card)] for f in field_table()}
+    keys = {f.name: _shard_key(f.name, 0, card) for f in field_table()}
+    files = {name: contents[key] for name, key in keys.items() if key in contents}
     digest = hashlib.sha256()
     for data in files.values():
         digest.update(data)
@@ -293,7 +296,7 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
         "n": count,
         "rejected": int(arrays["rejected"].sum()),
         "sha256": digest.hexdigest(),
-        "bytes": {name: len(data) for name, data in files.items()},
+        "bytes": {name: len(files.get(name, b"")) for name in keys},
     }
     return Encoded(shard_id=shard_id, files=files, line=line)
 
@@ -326,7 +329,6 @@ def _make_group(store: MemoryStore, card: Mapping[str, Any], names: Sequence[str
             dtype=field.dtype,
             compressors=_compressor(field.codec),
             filters=None,
-            config={"write_empty_chunks": True},  # an all-zero patch is data, not a hole
             dimension_names=[
                 "sample",
                 *[str(s) if isinstance(s, str) else f"axis{i}" for i, s in enumerate(field.shape)],

@@ -219,5 +219,7 @@ def load_pretrained(stem: Stem, name: str, weights: str | None) -> None:
         path = hf_hub_download(HUB_REPOSITORY, HUB_FILE)
     except Exception as error:  # the hub's client raises errors of several libraries
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise ConfigError(f"{HUB_REPOSITORY}/{HUB_FILE} cannot be fetched from the hub ({reason[:120]}): {ways}") from error
+        raise ConfigError(
+            f"{HUB_REPOSITORY}/{HUB_FILE} cannot be fetched from the hub ({reason[:120]}): {ways}"
+        ) from error
     load_weights(stem, Path(path))

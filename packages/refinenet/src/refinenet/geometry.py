@@ -68,7 +68,7 @@ def rotation_angle_deg(R: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
 
 def positive_depth_m(z_m: Tensor, near_m: float = NEAR_M) -> Tensor:
     """Depth itself from `near_m` on; below, a once differentiable bend that stays positive and keeps a gradient."""
-    # The bend's argument is clamped too: in the branch torch.where discards, a division by zero still poisons gradients.
+    # The bend's argument is clamped too: a division by zero poisons gradients even where torch.where discards it.
     bent = near_m**2 / (2 * near_m - torch.clamp(z_m, max=near_m))
     return torch.where(z_m > near_m, z_m, bent)
 

@@ -53,9 +53,7 @@ class ObjectPoints(NamedTuple):
         return ObjectPoints(*(x.to(device) for x in self))
 
 
-def sample_distance(
-    distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b n 2"]
-) -> Float[Tensor, "b n"]:
+def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
     """Distance transform at continuous pixels, bilinear between pixel centres (which lie at + 0.5).
 
     Beyond the outermost pixel centres a point is charged the nearest border value plus its distance from there:

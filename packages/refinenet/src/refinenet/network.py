@@ -1,4 +1,4 @@
-"""The two networks: PaperNet (two frozen stems, late fusion) and CompactNet (small, early fusion)."""
+"""The two networks: PaperNet (two frozen stems, late fusion) and CompactNet (small, local correlation)."""
 
 from typing import NamedTuple
 
@@ -43,8 +43,7 @@ class _Branch(nn.Module):
         self.reduction = nn.Conv2d(InceptionA.c_out, channels, 3, stride=2, padding=1)
         self.head = nn.Conv2d(channels, outputs, 6)
         nn.init.normal_(self.head.weight, std=head_std)
-        with torch.no_grad():
-            self.head.bias.copy_(torch.tensor(bias))
+        self.head.bias = nn.Parameter(torch.tensor(bias))
 
     def forward(self, x: Float[Tensor, "b 384 12 12"]) -> Float[Tensor, "b k"]:
         return self.head(torch.relu(self.reduction(self.blocks(x)))).flatten(1)
@@ -77,42 +76,73 @@ class PaperNet(nn.Module):
             low = self.stem(normalised(torch.cat((pair.scene_rgb, pair.hypothesis_rgb))))
         x = torch.cat((low[:b], low[b:]), 1)
         x = self.blocks(torch.cat((self.pool(x), self.down(x)), 1))
-        return PoseUpdate(geometry.rotation_from_quat_wxyz(self.rotation(x)), self.translation(x))
+        quat, translation = self.rotation(x), self.translation(x)
+        with torch.autocast(x.device.type, enabled=False):
+            return PoseUpdate(geometry.rotation_from_quat_wxyz(quat.float()), translation.float())
 
 
-class _Residual(nn.Module):
-    """Two 3 x 3 convolutions around a shortcut."""
+class LocalCorrelation(nn.Module):
+    """How well each hypothesis cell matches the scene cells around it: (b, c, n, n) twice to (b, k*k, n/2, n/2).
 
-    def __init__(self, channels: int) -> None:
+    Dot products of features over `sqrt(c)`, for every second hypothesis cell in both directions, with the scene cells
+    up to `radius` away; scene cells outside the patch match with 0.
+
+    Source: the correlation layer of FlowNet (Dosovitskiy et al., ICCV 2015).
+    """
+
+    def __init__(self, cells: int, radius: int) -> None:
         super().__init__()
-        self.first = ConvNorm(channels, channels, 3, padding=1)
-        self.second = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
-        self.norm = nn.BatchNorm2d(channels)
+        self.radius, self.side = radius, 2 * radius + 1
+        row, column = torch.meshgrid(torch.arange(0, cells, 2), torch.arange(0, cells, 2), indexing="ij")
+        down, right = torch.meshgrid(torch.arange(self.side), torch.arange(self.side), indexing="ij")
+        padded = cells + 2 * radius
+        where = (row.flatten()[:, None] + down.flatten()) * padded + column.flatten()[:, None] + right.flatten()
+        self.register_buffer("where", where[None], persistent=False)
+        self.where: Tensor
 
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(x + self.norm(self.second(self.first(x))))
+    def forward(
+        self, hypothesis: Float[Tensor, "b c n n"], scene: Float[Tensor, "b c n n"]
+    ) -> Float[Tensor, "b k m m"]:
+        """Match features of both patches."""
+        b, c, n, _ = hypothesis.shape
+        r = self.radius
+        queries = hypothesis[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(b, -1, c)
+        keys = nn.functional.pad(scene, (r, r, r, r)).permute(0, 2, 3, 1).reshape(b, -1, c)
+        all_pairs = torch.bmm(queries, keys.transpose(1, 2)) * c**-0.5
+        near = all_pairs.gather(2, self.where.expand(b, -1, -1))
+        return near.reshape(b, n // 2, n // 2, -1).permute(0, 3, 1, 2)
 
 
 class CompactNet(nn.Module):
-    """`plus` made small: the stacked pair through a short convolutional net, heads for 6D rotation, xy and log z.
+    """`plus` made small: match scene and hypothesis locally, then heads for 6D rotation, image-plane xy and log z.
 
-    LayerNorm and GELU before the heads: a ReLU there died in training. See `geometry.crop_update` for the output.
+    The stacked pair alone moved x and y, but learnt rotation several times more slowly: where each part of the object
+    went is what rotation is read from, and plain convolutions have to learn to compare first. LayerNorm and GELU before
+    the heads: a ReLU there died in training. See `geometry.crop_update` for the output.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        first, *rest = config.widths
-        layers: list[nn.Module] = [ConvNorm(6, first, 5, stride=2, padding=2)]
-        for c_in, c_out in zip((first, *rest), rest, strict=False):
-            layers.append(ConvNorm(c_in, c_out, 3, stride=2, padding=1))
-            layers.extend(_Residual(c_out) for _ in range(config.blocks))
-        self.features = nn.Sequential(*layers)
-        side = config.patch_px
-        for _ in config.widths:
-            side = (side + 1) // 2
-        self.trunk = nn.Sequential(
-            nn.Flatten(), nn.Linear(config.widths[-1] * side * side, config.hidden), nn.LayerNorm(config.hidden), nn.GELU()
+        first, second = config.encoder
+        self.scene = nn.Sequential(
+            ConvNorm(3, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
         )
+        self.hypothesis = nn.Sequential(
+            ConvNorm(3, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
+        )
+        self.match_scene = nn.Conv2d(second, config.match_channels, 1)
+        self.match_hypothesis = nn.Conv2d(second, config.match_channels, 1)
+        cells = config.patch_px // 4
+        self.correlation = LocalCorrelation(cells, config.match_radius)
+        self.appearance = ConvNorm(2 * second, config.appearance_channels, 3, stride=2, padding=1)
+        mixed, last = config.widths
+        self.mix = nn.Sequential(
+            ConvNorm(self.correlation.side**2 + config.appearance_channels, mixed, 1),
+            ConvNorm(mixed, last, 3, padding=1),
+            nn.Flatten(),
+            nn.Linear(last * (cells // 2) ** 2, config.hidden),
+        )
+        self.norm = nn.Sequential(nn.LayerNorm(config.hidden), nn.GELU())
         self.rotation = nn.Linear(config.hidden, 6)
         self.translation = nn.Linear(config.hidden, 3)
         for head, bias in ((self.rotation, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)), (self.translation, (0.0, 0.0, 0.0))):
@@ -122,12 +152,21 @@ class CompactNet(nn.Module):
         self.patch_px = config.patch_px
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
+    def features(self, pair: Pair) -> Float[Tensor, "b h"]:
+        """What the heads read; runs in reduced precision under autocast."""
+        scene = self.scene(normalised(pair.scene_rgb).contiguous(memory_format=torch.channels_last))
+        hypothesis = self.hypothesis(normalised(pair.hypothesis_rgb).contiguous(memory_format=torch.channels_last))
+        matches = self.correlation(self.match_hypothesis(hypothesis), self.match_scene(scene))
+        appearance = self.appearance(torch.cat((scene, hypothesis), 1))
+        return self.mix(torch.cat((matches, appearance), 1).contiguous(memory_format=torch.channels_last))
+
     def forward(self, pair: Pair) -> PoseUpdate:
         """The update of each hypothesis."""
-        x = torch.cat((normalised(pair.hypothesis_rgb), normalised(pair.scene_rgb)), 1)
-        x = self.trunk(self.features(x.contiguous(memory_format=torch.channels_last)))
-        rotation_ray = geometry.rotation_from_6d(self.rotation(x))
-        return geometry.crop_update(rotation_ray, self.translation(x), pair.T_cam_obj, pair.K_crop, self.patch_px)
+        x = self.features(pair)
+        with torch.autocast(x.device.type, enabled=False):  # poses need every digit
+            x = self.norm(x.float())
+            rotation_ray = geometry.rotation_from_6d(self.rotation(x))
+            return geometry.crop_update(rotation_ray, self.translation(x), pair.T_cam_obj, pair.K_crop, self.patch_px)
 
 
 def make_network(config: NetworkConfig) -> nn.Module:

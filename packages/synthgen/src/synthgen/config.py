@@ -121,7 +121,7 @@ class PerturbationConfig:
 
     Attributes:
         max_angle_deg: The angle is uniform in 0 to this, about a random axis.
-        max_translation_diameter: The origin moves in a random direction, the length uniform in 0 to this many diameters.
+        max_translation_diameter: The object moves in a random direction, the length uniform in 0 to this.
         easy_share: Share of hypotheses whose two bounds are multiplied by `easy_scale`, so that a refiner also sees
             starts that are nearly right.
         easy_scale: That factor.
@@ -227,7 +227,7 @@ class OccluderConfig:
 
     library: int = 32
     size_diameter: Range = (0.25, 1.0)
-    front: IntRange = (0, 3)
+    front: IntRange = (0, 2)
     props: IntRange = (0, 3)
     min_visible: float = 0.4
 

@@ -1,0 +1,128 @@
+"""Pages that are made from the project itself when the documentation is built, so that they cannot fall behind it."""
+
+import html
+import importlib
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import yaml
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAMS = ("synthgen", "refinenet", "evalkit")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the generated pages (called by mkdocs)."""
+    pages = {
+        "conventions.md": (ROOT / "data_specs" / "conventions.md").read_text(encoding="utf-8"),
+        "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        "data-format.md": data_format_page(),
+        "cli.md": cli_page(),
+    }
+    for name, content in pages.items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def commands(program: str) -> Iterator[tuple[str, click.Command]]:
+    """Yield (full name, command) for a program and everything below it."""
+    root: click.Command = importlib.import_module(f"{program}.cli").main
+    stack = [(program, root)]
+    while stack:
+        name, command = stack.pop()
+        yield name, command
+        if isinstance(command, click.Group):
+            stack += [(f"{name} {child}", command.commands[child]) for child in sorted(command.commands, reverse=True)]
+
+
+def cli_page() -> str:
+    """Return the command-line reference: every command with its help, its arguments and its options."""
+    lines = [
+        "# Commands",
+        "",
+        "Made from the programs' own `--help`. Exit codes: 0 done, 1 failed, 2 wrong usage or configuration.",
+        "",
+    ]
+    for program in PROGRAMS:
+        for name, command in commands(program):
+            lines += [f"{'#' * min(2 + name.count(' '), 4)} {name}", "", *_help_text(command), ""]
+            lines += [*_parameters(command), ""]
+    return "\n".join(lines)
+
+
+def _help_text(command: click.Command) -> list[str]:
+    """Turn click's help text into Markdown; paragraphs that click is told not to wrap become code."""
+    out: list[str] = []
+    for paragraph in re.split(r"\n\s*\n", inspect.cleandoc(command.help or "")):
+        if paragraph.startswith("\b"):
+            title, *rest = paragraph.lstrip("\b\n").splitlines()
+            is_title = title.endswith(":")
+            body = rest if is_title else [title, *rest]
+            out += [title, ""] if is_title else []
+            out += ["```text", *inspect.cleandoc("\n".join(body)).splitlines(), "```", ""]
+        else:
+            out += [paragraph, ""]
+    return out
+
+
+def _parameters(command: click.Command) -> list[str]:
+    context = click.Context(command, show_default=True)
+    rows: list[str] = []
+    for parameter in command.params:
+        if isinstance(parameter, click.Option):
+            if parameter.hidden:
+                continue
+            name, text = parameter.get_help_record(context) or ("", "")
+        else:
+            name, text = parameter.make_metavar(context), "Argument, see above."
+        rows.append(f"| <code>{_cell(name)}</code> | {_cell(text)} |")
+    return ["| argument or option | meaning |", "|---|---|", *rows] if rows else []
+
+
+def _cell(text: str) -> str:
+    return html.escape(" ".join(text.split()), quote=False).replace("|", "&#124;").replace("*", "&#42;")
+
+
+def data_format_page() -> str:
+    """Return the page on pair shards, its table from `data_specs/shard_fields.yaml`."""
+    spec: dict[str, Any] = yaml.safe_load((ROOT / "data_specs" / "shard_fields.yaml").read_text(encoding="utf-8"))
+    lines = [
+        "# Data format",
+        "",
+        f"A dataset of training pairs is a Zarr v3 group, schema `{spec['schema']}` version {spec['schema_version']}, "
+        "with one array per field and the native sharding codec. Every array has the sample axis in front. `P` is the "
+        "patch side in pixels and `C` the number of contour points, both in the data card.",
+        "",
+        "| field | on disk | shape | unit | scale | what |",
+        "|---|---|---|---|---|---|",
+    ]
+    for name, field in spec["fields"].items():
+        shape = " x ".join(["n", *map(str, field["shape"])])
+        scale = f"{field['scale']:g}" if "scale" in field else ""
+        lines.append(f"| `{name}` | {field['dtype']} | {shape} | {field['unit']} | {scale} | {_cell(field['text'])} |")
+    lines += [
+        "",
+        "A stored integer times its scale is the value in the unit; `posecore.shard.ShardReader` does that.",
+        "",
+        "## The data card",
+        "",
+        "The group's attributes say how the dataset was made: schema and version, number of samples, shard size, patch "
+        "side, contour points, seed, the resolved configuration, the camera, each object with the hash of its file and "
+        "its diameter, the versions of the software, and the units. The meshes lie beside it in `models/`, in BOP's "
+        "layout (millimetres), so a dataset needs nothing else.",
+        "",
+        "## Complete or absent",
+        "",
+        "A shard is written under a temporary name, checksummed and renamed, and then gets its line in "
+        "`manifest.jsonl`. A process killed at any moment loses at most the shards it was working on, and the same "
+        "command goes on where it stopped. Sample *i* belongs to scene *i // hypotheses per scene*; training and "
+        "validation are split by scene.",
+        "",
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,284 @@
+"""From a mesh to a report: render pairs, train a small network, refine poses it has never seen, compare.
+
+    python examples/quickstart.py quickstart
+
+Each step is one command of the project, shown as you would type it. A step that is complete is not done again, so the
+script can be stopped and started at will. At the end it checks that the network just trained earned its keep.
+"""
+
+import argparse
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+import webbrowser
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+OBJECT = ROOT / "examples" / "objects" / "tug.ply"
+SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Size:
+    """How much of everything.
+
+    Attributes:
+        pairs: Training pairs.
+        frames: Test images.
+        engine: Renderer of both.
+        train: Further options of `refinenet train`.
+        minutes: What to expect on two CPU cores, for the user.
+    """
+
+    pairs: int
+    frames: int
+    engine: str
+    train: str = ""
+    minutes: str
+
+
+FULL = Size(pairs=4000, frames=40, engine="cycles", minutes="about 15 minutes")
+SMOKE = Size(
+    pairs=128,
+    frames=3,
+    engine="raster",
+    train="--steps 12 --batch 8 --set validation.pairs=16",
+    minutes="about a minute",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """One command.
+
+    Attributes:
+        name: Short and unique; the note of how far it came is kept under it.
+        why: One line for the reader.
+        command: Program and arguments.
+        leaves: What it leaves in the working folder; without it the step is not complete, whatever the note says.
+        inside: Whether it runs in the working folder instead of beside it.
+    """
+
+    name: str
+    why: str
+    command: tuple[str, ...]
+    leaves: str
+    inside: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Promise:
+    """One line of what the quick start promises, as found in the report."""
+
+    text: str
+    kept: bool
+
+
+def steps(work: Path, size: Size) -> Iterator[Step]:
+    """Yield the commands of the quick start in order."""
+    folder, mesh = quoted(work), quoted(OBJECT)
+    scenes = f"--object {mesh} --preset quickstart --engine {size.engine}"
+    yield Step(
+        name="pairs",
+        why="Training pairs of the object, from its mesh alone.",
+        command=words(f"synthgen render {scenes} --n {size.pairs} --seed 1 --workers 2 --out {folder}/shards"),
+        leaves="shards/manifest.jsonl",
+    )
+    yield Step(
+        name="test-images",
+        why="Test images with ground truth: other scenes.",
+        command=words(f"synthgen bop {scenes} --frames {size.frames} --seed 2 --out {folder}/test_bop"),
+        leaves="test_bop/models/models_info.json",
+    )
+    yield Step(
+        name="train",
+        why="A small refinement network.",
+        command=words(f"refinenet train {folder}/shards --preset compact {size.train} --out {folder}/run"),
+        leaves="run/best.safetensors",
+    )
+    yield Step(
+        name="start-poses",
+        why="Start poses: ground truth, turned by up to 20 degrees and moved by up to 0.2 diameters.",
+        command=words(
+            f"evalkit perturb --dataset {folder}/test_bop --random-up-to 20 --random-translation 0.2 --seed 3"
+            f" --out {folder}/results/start.csv"
+        ),
+        leaves="results/start.csv",
+    )
+    refine = f"refinenet refine --dataset {folder}/test_bop --init {folder}/results/start.csv"
+    yield Step(
+        name="refine-quick",
+        why="Better poses, with that network.",
+        command=words(f"{refine} --checkpoint {folder}/run/best.safetensors --out {folder}/results/quick.csv"),
+        leaves="results/quick.csv",
+    )
+    if SHIPPED.is_file():
+        yield Step(
+            name="refine-shipped",
+            why="And with a network that trained for longer.",
+            command=words(f"{refine} --checkpoint {quoted(SHIPPED)} --out {folder}/results/shipped.csv"),
+            leaves="results/shipped.csv",
+        )
+    yield Step(
+        name="report",
+        why="What came of it, on one page.",
+        command=words("evalkit report"),
+        leaves="report/summary.json",
+        inside=True,
+    )
+
+
+def words(line: str) -> tuple[str, ...]:
+    """Split a command line as a shell would."""
+    return tuple(shlex.split(line))
+
+
+def quoted(path: Path) -> str:
+    """Path as the user would type it."""
+    return shlex.quote(shown(path))
+
+
+def shown(path: Path) -> str:
+    """Path as the user would type it: relative to where the script was started, if it lies below."""
+    here = Path.cwd()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
+def executable(program: str) -> str:
+    """Find a program of the project, first beside the Python that runs this."""
+    beside = Path(sys.executable).with_name(program)
+    found = str(beside) if beside.is_file() else shutil.which(program)
+    if found is None:
+        raise SystemExit(
+            f"Error: the command {program} is not installed here; run `make setup`, then `make quickstart`"
+        )
+    return found
+
+
+def run_all(work: Path, size: Size) -> None:
+    """Run the steps that are not complete; a step that ran makes all later ones run again."""
+    everything = list(steps(work, size))
+    marks = [work / ".steps" / f"{step.name}.json" for step in everything]
+    complete = [
+        marked(mark, step, "complete") and (work / step.leaves).exists()
+        for mark, step in zip(marks, everything, strict=True)
+    ]
+    todo = [*complete, False].index(False)
+    for step in everything[:todo]:
+        say(f"{step.why} Done already.")
+    began_all = time.monotonic()
+    for number, step in enumerate(everything[todo:], start=todo):
+        interrupted = number == todo and marked(marks[number], step, "started")
+        for mark in marks[number:]:
+            mark.unlink(missing_ok=True)
+        write_mark(marks[number], step, "started")
+        say(f"\n[{number + 1}/{len(everything)}] {step.why}")
+        began = time.monotonic()
+        run_step(step, work, interrupted)
+        took_s = time.monotonic() - began
+        write_mark(marks[number], step, "complete", seconds=round(took_s, 1))
+        say(f"  {took_s:.0f} s")
+    if todo < len(everything):
+        say(f"\nTogether: {(time.monotonic() - began_all) / 60:.1f} min")
+
+
+def run_step(step: Step, work: Path, interrupted: bool) -> None:
+    """Run one command, shown as it would be typed.
+
+    Args:
+        step: What to run.
+        work: Working folder.
+        interrupted: Whether this very command was started before and not completed. Training has to be told so; the
+            other commands see it for themselves.
+    """
+    arguments = step.command[1:]
+    if step.name == "train":
+        if interrupted and (work / "run" / "last.safetensors").is_file():
+            arguments = (*arguments, "--resume")
+        else:
+            shutil.rmtree(work / "run", ignore_errors=True)
+    program = step.command[0]
+    say(f"  $ {f'cd {shown(work)} && ' if step.inside else ''}{shlex.join((program, *arguments))}")
+    code = subprocess.run([executable(program), *arguments], cwd=work if step.inside else None).returncode
+    if code:
+        raise SystemExit(f"Error: {program} {arguments[0]} ended with exit code {code}; the reason stands above")
+
+
+def marked(mark: Path, step: Step, state: str) -> bool:
+    """Tell whether this very command was left in this state."""
+    if not mark.is_file():
+        return False
+    found = json.loads(mark.read_text(encoding="utf-8"))
+    return bool(found["command"] == list(step.command) and found["state"] == state)
+
+
+def write_mark(mark: Path, step: Step, state: str, **values: float) -> None:
+    """Leave a note of how far a step came."""
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    mark.write_text(json.dumps({"state": state, "command": step.command, **values}), encoding="utf-8")
+
+
+def promises(summary: dict[str, Any]) -> list[Promise]:
+    """Compare the poses of the network just trained with the start poses, by the report's numbers."""
+    quick = next(entry for entry in summary["against_start"] if entry["name"] == "quick")
+    vss, medians = quick["vss_mean"], quick["medians"]
+    gain = vss["refined"] - vss["start"]
+    bounds = [("median error in x", "tx_mm", 0.5), ("median error in y", "ty_mm", 0.5)]
+    bounds += [("median rotation error", "re_sym_deg", 0.8)]
+    # A start without error has no ratio; that keeps no promise.
+    shares = [(name, medians[key]["ratio"] or float("nan"), most) for name, key, most in bounds]
+    none_lost = Promise(text=f"poses without a result: {quick['missing']} (promised none)", kept=quick["missing"] == 0)
+    return [
+        Promise(text=f"mean VSS up by {gain:.3f} (promised 0.08)", kept=gain >= 0.08),
+        *(
+            Promise(text=f"{name}: {x:.2f} of the start's (promised {most})", kept=x <= most)
+            for name, x, most in shares
+        ),
+        none_lost,
+    ]
+
+
+def show(page: Path) -> None:
+    """Say where the report is, and open it where there is a display."""
+    say(f"\nReport: {page.resolve()}")
+    if sys.platform == "darwin" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(page.resolve().as_uri())
+
+
+def say(text: str) -> None:
+    """Write a line at once, so that it stands before the output of the command it announces."""
+    print(text, flush=True)
+
+
+def main() -> int:
+    """Run the quick start; return 1 where the promised improvement is missing."""
+    parser = argparse.ArgumentParser(description="From a mesh to a report, in one go.")
+    parser.add_argument("work", nargs="?", type=Path, default=Path("quickstart"), help="working folder (%(default)s)")
+    parser.add_argument("--smoke", action="store_true", help="tiny, rasterised, and no promise: a test of the plumbing")
+    arguments = parser.parse_args()
+    work, size = arguments.work.resolve(), SMOKE if arguments.smoke else FULL
+    say(f"Working in {shown(work)}; {size.minutes} on two CPU cores. Stop with Ctrl-C, start again to go on.")
+    try:
+        run_all(work, size)
+    except KeyboardInterrupt:
+        raise SystemExit("\nStopped. The same command goes on from here.") from None
+    kept = True
+    if not arguments.smoke:
+        say("\nWhat the network just trained did to poses on images it has never seen:")
+        summary = json.loads((work / "report" / "summary.json").read_text(encoding="utf-8"))
+        for promise in promises(summary):
+            say(f"  {'ok    ' if promise.kept else 'MISSED'} {promise.text}")
+            kept = kept and promise.kept
+    show(work / "report" / "index.html")
+    return 0 if kept else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,3 @@
+"""Scores 6D poses: a BOP dataset and result files in, errors, recalls and a report out."""
+
+__version__ = "0.1.0"

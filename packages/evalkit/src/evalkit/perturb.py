@@ -1,0 +1,112 @@
+"""Start poses from ground truth: rotated and moved by known amounts, so that convergence can be drawn as a curve."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from posecore import se3
+from posecore.bop import BopDataset, Estimate, GroundTruth, Target, write_results
+from posecore.errors import ConfigError
+
+from evalkit import __version__
+from evalkit.files import START_METHOD
+from evalkit.pairing import Level, truths_of
+
+
+def levels_of(angles_deg: Sequence[float], translations_diameter: Sequence[float]) -> list[Level]:
+    """One level for each angle without translation, and one for each translation without rotation.
+
+    Raises:
+        ConfigError: a level is outside 0 to 180 degrees, or negative.
+    """
+    if any(not 0 <= angle <= 180 for angle in angles_deg):
+        raise ConfigError(f"--angles: found {_listed(angles_deg)}, expected degrees from 0 to 180")
+    if any(not (np.isfinite(share) and share >= 0) for share in translations_diameter):
+        raise ConfigError(f"--translations: found {_listed(translations_diameter)}, expected diameters, 0 or more")
+    levels = [Level(angle_deg=angle, translation_diameter=0.0) for angle in angles_deg]
+    levels += [Level(angle_deg=0.0, translation_diameter=share) for share in translations_diameter]
+    return list(dict.fromkeys(levels))
+
+
+def perturb_dataset(
+    dataset: BopDataset,
+    out: Path,
+    *,
+    levels: Sequence[Level],
+    seed: int,
+    random_up_to: Level | None = None,
+) -> int:
+    """Write start poses for every target, and in the sidecar the level of every line.
+
+    A pose is rotated by exactly its angle about a random axis through the object's origin (in camera axes) and moved
+    by exactly its length in a random direction. Randomness depends on the seed and the target's ids only.
+
+    Args:
+        dataset: with ground truth.
+        out: result file.
+        levels: levels for every target, one line each.
+        seed: of all draws.
+        random_up_to: where given, one more line for each target, its angle and length drawn evenly from 0 up to these.
+
+    Returns:
+        Number of lines.
+
+    Raises:
+        ConfigError: neither levels nor random ones are wanted.
+    """
+    if not levels and random_up_to is None:
+        raise ConfigError("no levels: give --angles 5,10,15 or --translations 0.1,0.2 or --random-up-to 20")
+    estimates: list[Estimate] = []
+    rows: list[dict[str, Any]] = []
+    for target in dataset.targets:
+        diameter_m = dataset.models_info[target.obj_id].diameter_m
+        for truth in truths_of(dataset, target)[: target.inst_count]:
+            rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, truth.gt_index])
+            drawn = [_drawn(random_up_to, rng)] if random_up_to else []
+            for number, level in enumerate([*levels, *drawn]):
+                estimates.append(_start(target, truth, level, diameter_m, rng))
+                row = _sidecar_row(len(estimates) + 1, target, truth, level)
+                rows.append(row | {"random": number >= len(levels)})
+    sidecar = {
+        "dataset": str(dataset.root.resolve()),
+        "split": dataset.split,
+        "method": START_METHOD,
+        "settings": {"seed": seed, "evalkit": __version__},
+        "perturbation": {"rows": rows},
+    }
+    write_results(out, estimates, sidecar)
+    return len(estimates)
+
+
+def _drawn(limit: Level, rng: np.random.Generator) -> Level:
+    return Level(
+        angle_deg=float(rng.uniform(0.0, limit.angle_deg)),
+        translation_diameter=float(rng.uniform(0.0, limit.translation_diameter)),
+    )
+
+
+def _start(target: Target, truth: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator) -> Estimate:
+    distance_m = level.translation_diameter * diameter_m
+    return Estimate(
+        scene_id=target.scene_id,
+        im_id=target.im_id,
+        obj_id=target.obj_id,
+        T_cam_obj=se3.perturb(truth.T_cam_obj, float(np.deg2rad(level.angle_deg)), distance_m, rng),
+    )
+
+
+def _sidecar_row(line: int, target: Target, truth: GroundTruth, level: Level) -> dict[str, Any]:
+    return {
+        "line": line,
+        "scene_id": target.scene_id,
+        "im_id": target.im_id,
+        "obj_id": target.obj_id,
+        "gt_index": truth.gt_index,
+        "angle_deg": level.angle_deg,
+        "translation_diameter": level.translation_diameter,
+    }
+
+
+def _listed(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:g}" for value in values)

@@ -1,0 +1,103 @@
+"""A report folder: one HTML page, one CSV line for each pose, one JSON summary."""
+
+import csv
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from posecore.bop import BopDataset
+from posecore.errors import ConfigError
+from posecore.files import write_atomic
+
+from evalkit.evaluate import ROW_FIELDS, Evaluator, Row, VssKind
+from evalkit.files import load_result_files
+from evalkit.page import report_page
+from evalkit.pairing import Pairing, pair_up
+from evalkit.summary import Scored, summarise
+
+Start = Callable[[str, int], Callable[[int], None]]
+"""Announces a result file and its number of poses; returns what is called as they are done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Where a report was written, and its summary."""
+
+    page: Path
+    table: Path
+    summary_file: Path
+    summary: dict[str, Any]
+
+
+def write_report(
+    dataset: BopDataset,
+    results: Sequence[Path],
+    out: Path,
+    *,
+    vss: VssKind = "full",
+    worst: int = 12,
+    start: Start = lambda name, total: lambda done: None,
+) -> Report:
+    """Evaluate result files and write `index.html`, `estimates.csv` and `summary.json` into `out`.
+
+    Args:
+        dataset: with ground truth.
+        results: BOP result files; start poses are known by `method: start` in their sidecar.
+        out: folder, made where it does not exist.
+        vss: whole silhouettes or visible parts.
+        worst: number of worst cases to show as pictures.
+        start: progress, see `Start`.
+
+    Raises:
+        PoseError: a file or the dataset is not usable; the message names it.
+    """
+    if not results:
+        raise ConfigError("no result files: name them with --results FILE.csv")
+    files = load_result_files(results, dataset)
+    pairings: list[Pairing] = [pair_up(dataset, file) for file in files]
+    with Evaluator(dataset, vss) as evaluator:
+        scored = [
+            Scored(
+                file=file,
+                pairs=pairing.pairs,
+                rows=evaluator.evaluate(pairing.pairs, start(file.name, len(pairing.pairs))),
+                ignored=pairing.ignored,
+            )
+            for file, pairing in zip(files, pairings, strict=True)
+        ]
+        summary = summarise(dataset, scored, vss)
+        page = report_page(evaluator, scored, summary, worst)
+    written = Report(
+        page=out / "index.html",
+        table=out / "estimates.csv",
+        summary_file=out / "summary.json",
+        summary=summary,
+    )
+    write_atomic(written.table, estimates_csv(scored).encode())
+    write_atomic(written.summary_file, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
+    write_atomic(written.page, page.encode())
+    return written
+
+
+def estimates_csv(scored: Sequence[Scored]) -> str:
+    """One line for each expected pose of each result file; NaN is left empty, units are in the column names."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["results", *ROW_FIELDS])
+    for item in scored:
+        for row in item.rows:
+            writer.writerow([item.file.name, *(_plain(row, name) for name in ROW_FIELDS)])
+    return text.getvalue()
+
+
+def _plain(row: Row, name: str) -> str:
+    value = getattr(row, name)
+    if isinstance(value, bool | np.bool_):
+        return str(int(value))
+    if isinstance(value, float):
+        return "" if np.isnan(value) else f"{value:.9g}"
+    return str(value)

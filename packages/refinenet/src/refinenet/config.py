@@ -1,0 +1,304 @@
+"""Configuration of training and refinement; the two presets are YAML files beside this module."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Literal
+
+from posecore import config as posecore_config
+from posecore.errors import ConfigError
+
+PRESETS = ("paper", "compact")
+
+
+def _require(ok: bool, message: str) -> None:
+    if not ok:
+        raise ConfigError(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackboneConfig:
+    """The frozen stem of preset `paper`.
+
+    Attributes:
+        name: which stem.
+        pretrained: whether ImageNet weights are loaded when training starts from scratch.
+        weights: safetensors file to load them from; None asks the Hugging Face hub.
+    """
+
+    name: Literal["inception_v4", "inception_v3"] = "inception_v4"
+    pretrained: bool = True
+    weights: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """Architecture.
+
+    Attributes:
+        kind: `paper` or `compact`.
+        patch_px: side of both input patches.
+        backbone: stem of `paper`.
+        branch_channels: channels of `paper`'s last strided convolution, before the heads.
+        encoder: channels of the two stages that each of `compact`'s patches goes through, to a quarter of its size.
+        match_channels: length of the features whose dot products `compact` matches.
+        match_radius: how far it matches, in cells of a quarter of the patch's resolution.
+        appearance_channels: channels that tell `compact` what is there, beside what moved.
+        widths: channels of the two layers after matching, at an eighth of the patch's size.
+        hidden: units before `compact`'s heads.
+        head_std: standard deviation of the heads' initial weights.
+    """
+
+    kind: Literal["paper", "compact"]
+    patch_px: int
+    backbone: BackboneConfig = field(default_factory=BackboneConfig)
+    branch_channels: int = 96
+    encoder: tuple[int, int] = (24, 48)
+    match_channels: int = 32
+    match_radius: int = 4
+    appearance_channels: int = 64
+    widths: tuple[int, int] = (96, 128)
+    hidden: int = 256
+    head_std: float = 1e-3
+
+    def __post_init__(self) -> None:
+        _require(16 <= self.patch_px <= 1024, f"patch_px is {self.patch_px}, expected 16 to 1024")
+        _require(
+            self.kind != "paper" or self.patch_px == 224, f"patch_px is {self.patch_px}: kind=paper is built for 224"
+        )
+        _require(self.patch_px % 8 == 0, f"patch_px is {self.patch_px}, expected a multiple of 8")
+        _require(1 <= self.match_radius <= 16, f"match_radius is {self.match_radius}, expected 1 to 16 cells")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WindowConfig:
+    """How patches are cut.
+
+    Attributes:
+        kind: `fixed` (one side per object, from the data card) or `diameter` (scale x f x diameter / z).
+        scale: side of a `diameter` window in projected diameters.
+    """
+
+    kind: Literal["fixed", "diameter"]
+    scale: float = 1.5
+
+    def __post_init__(self) -> None:
+        _require(1.0 <= self.scale <= 5.0, f"scale is {self.scale}, expected 1 to 5 diameters")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HypothesisConfig:
+    """Hypotheses rendered in the training loop.
+
+    Attributes:
+        fresh: draw and render them anew at every pass; otherwise the shards' own pairs are used.
+        max_angle_deg: largest rotation; angles are uniform up to it.
+        max_translation_diameter: largest move, in object diameters; lengths are uniform up to it.
+        easy_share: share of samples whose range is scaled down at random, for the later iterations of a refinement.
+        in_plane: turn each scene about the optical axis by a random angle.
+    """
+
+    fresh: bool = False
+    max_angle_deg: float = 25.0
+    max_translation_diameter: float = 0.2
+    easy_share: float = 0.3
+    in_plane: bool = True
+
+    def __post_init__(self) -> None:
+        _require(0 < self.max_angle_deg <= 180, f"max_angle_deg is {self.max_angle_deg}, expected above 0 up to 180")
+        _require(0 <= self.easy_share <= 1, f"easy_share is {self.easy_share}, expected 0 to 1")
+        _require(
+            0 <= self.max_translation_diameter <= 2,
+            f"max_translation_diameter is {self.max_translation_diameter}, expected 0 to 2",
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentConfig:
+    """Colour augmentation; probabilities are per sample.
+
+    Attributes:
+        permute_channels: probability of one random order of colour channels for both patches.
+        gain: both patches' channels are scaled by up to this share.
+        scene_gain: the scene's channels alone, likewise.
+        brightness: the scene is shifted by up to this share of the range.
+        contrast: the scene's contrast is scaled by up to this share.
+        noise: largest standard deviation of the scene's noise, in grey levels.
+        blur: probability that the scene is blurred.
+        background: probability that everything behind the scene's foreground is exchanged.
+    """
+
+    permute_channels: float = 0.0
+    gain: float = 0.0
+    scene_gain: float = 0.0
+    brightness: float = 0.0
+    contrast: float = 0.0
+    noise: float = 0.0
+    blur: float = 0.0
+    background: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("permute_channels", "blur", "background"):
+            value = getattr(self, name)
+            _require(0 <= value <= 1, f"{name} is {value}, expected a probability")
+        for name in ("gain", "scene_gain", "brightness", "contrast"):
+            value = getattr(self, name)
+            _require(0 <= value < 1, f"{name} is {value}, expected 0 to under 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LossConfig:
+    """The loss.
+
+    Attributes:
+        name: which.
+        gamma: weight of the translation in `mse`, per metre.
+        point_weight: weight of the point loss in `contour+point`.
+        contour_points: contour points used of each patch.
+        model_points: model points of the point loss.
+        symmetry_step_deg: step at which continuous symmetries are sampled for the point loss.
+    """
+
+    name: Literal["contour", "contour-forward", "mse", "point", "contour+point"] = "contour"
+    gamma: float = 10.0
+    point_weight: float = 1.0
+    contour_points: int = 100
+    model_points: int = 64
+    symmetry_step_deg: float = 10.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserConfig:
+    """Optimiser and its schedule.
+
+    Attributes:
+        name: `adam` or `adamw`.
+        lr: learning rate, its peak under `cosine`.
+        weight_decay: of `adamw`.
+        schedule: `constant`, or `cosine` down to a hundredth of `lr` at the last step.
+        warmup_steps: steps of linear rise.
+        gradient_clip: largest gradient norm; 0 leaves it alone.
+    """
+
+    name: Literal["adam", "adamw"] = "adam"
+    lr: float = 3e-4
+    weight_decay: float = 0.0
+    schedule: Literal["constant", "cosine"] = "constant"
+    warmup_steps: int = 0
+    gradient_clip: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require(self.lr > 0, f"lr is {self.lr}, expected a positive number")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoaderConfig:
+    """Reading of shards.
+
+    Attributes:
+        workers: loader processes; 0 loads in the training process. Each takes shards of its own.
+        shuffle_shards: shards whose samples are shuffled together.
+        prefetch: batches each worker prepares ahead.
+        cache_mb: decoded shards each worker keeps for the next epoch; 0 keeps none.
+    """
+
+    workers: int = 1
+    shuffle_shards: int = 4
+    prefetch: int = 4
+    cache_mb: int = 0
+
+    def __post_init__(self) -> None:
+        _require(self.workers >= 0, f"workers is {self.workers}, expected 0 or more")
+        _require(self.cache_mb >= 0, f"cache_mb is {self.cache_mb}, expected 0 or more")
+        _require(self.shuffle_shards >= 1, f"shuffle_shards is {self.shuffle_shards}, expected 1 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ValidationConfig:
+    """Held-out scenes, with hypotheses that stay the same throughout.
+
+    Attributes:
+        scene_share: share of scenes held out, at least one.
+        pairs: how many pairs are measured.
+        every: steps between measurements; the last step is always measured.
+    """
+
+    scene_share: float = 0.1
+    pairs: int = 256
+    every: int = 500
+
+    def __post_init__(self) -> None:
+        _require(0 < self.scene_share < 1, f"scene_share is {self.scene_share}, expected between 0 and 1")
+        _require(self.pairs >= 1 and self.every >= 1, "pairs and every must be 1 or more")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Everything that decides a training run, apart from its data.
+
+    Attributes:
+        preset: the preset it came from.
+        network: architecture.
+        window: how patches are cut.
+        hypothesis: how pairs are drawn.
+        augment: colour augmentation.
+        loss: loss.
+        optimiser: optimiser.
+        loader: loader.
+        validation: held-out measurement.
+        batch: pairs in a step, on each rank.
+        steps: steps of the run; the cosine schedule ends there.
+        seed: of weights, order, hypotheses and augmentation.
+        threads: torch threads; 0 leaves torch's own choice.
+        precision: of the convolutions in training; `auto` is bfloat16 on GPUs and on processors that compute in it,
+            float32 elsewhere. Poses, losses and weights are float32 always.
+        device: `cpu`, `cuda`, or `auto` for a GPU where there is one.
+        log_every: steps between lines of metrics.
+        checkpoint_every: steps between checkpoints.
+    """
+
+    preset: Literal["paper", "compact"]
+    network: NetworkConfig
+    window: WindowConfig
+    hypothesis: HypothesisConfig = field(default_factory=HypothesisConfig)
+    augment: AugmentConfig = field(default_factory=AugmentConfig)
+    loss: LossConfig = field(default_factory=LossConfig)
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+    loader: LoaderConfig = field(default_factory=LoaderConfig)
+    validation: ValidationConfig = field(default_factory=ValidationConfig)
+    batch: int = 16
+    steps: int = 100_000
+    seed: int = 0
+    threads: int = 0
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    log_every: int = 20
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("batch", "steps", "log_every", "checkpoint_every"):
+            value = getattr(self, name)
+            _require(value >= 1, f"{name} is {value}, expected 1 or more")
+        _require(
+            not self.hypothesis.fresh or self.window.kind == "diameter",
+            "hypothesis.fresh needs window.kind=diameter: a fixed window is the one the shards were cut with",
+        )
+
+
+def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = None) -> TrainConfig:
+    """A preset, overlaid with a YAML file's keys and then with `a.b=c` overrides.
+
+    `backbone.` may be written for `network.backbone.`.
+
+    Raises:
+        ConfigError: an unknown preset or key, or a value of the wrong type or out of range; named.
+    """
+    _require(preset in PRESETS, f"unknown preset '{preset}', expected one of: {', '.join(PRESETS)}")
+    mapping = posecore_config.load_yaml(Path(str(resources.files("refinenet").joinpath(f"presets/{preset}.yaml"))))
+    where = f"preset {preset}"
+    if file is not None:
+        mapping = posecore_config.merge(mapping, posecore_config.load_yaml(file))
+        where = str(file)
+    full = [f"network.{item}" if item.startswith("backbone.") else item for item in overrides]
+    return posecore_config.build(TrainConfig, posecore_config.apply_overrides(mapping, full), where)

@@ -1,0 +1,271 @@
+"""Pairs made in the training loop: a new hypothesis for a stored scene, rendered, with the scene cut anew to match.
+
+A shard stores the scene with one window. Here the scene is turned about the optical axis with its truth, a hypothesis
+is drawn near it, and the window that inference would cut for that hypothesis is resampled from the stored patch: one
+affine warp, because turning the camera about its optical axis and moving the window are both affine in the image.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from posecore import contour, se3
+from posecore.camera import crop_K
+from posecore.mesh import Mesh
+from posecore.raster import Rasteriser
+from posecore.window import Window, diameter_window
+
+from refinenet import augment
+from refinenet.config import AugmentConfig, HypothesisConfig
+
+Array = np.ndarray
+OBJECT, FOREGROUND = 1, 4
+"""Bits of a shard's scene_mask used here: the whole object, hidden parts too; and any object in the scene."""
+
+MIN_CONTOUR_PX = 12
+"""A contour of fewer pixels says nothing about a pose; the hypothesis is drawn again, nearer."""
+
+ATTEMPTS = 4
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PairArrays:
+    """One batch of pairs, every label in its patch's pixels; see `loss.Target` for the fields' meaning.
+
+    `kept` names the input samples the rows came from: one whose object cannot be seen in any window is left out and
+    another stands in its place.
+    """
+
+    scene_rgb: UInt8[Array, "b p p 3"]
+    hypothesis_rgb: UInt8[Array, "b p p 3"]
+    T_cam_obj: Float[Array, "b 4 4"]
+    T_cam_obj_hypothesis: Float[Array, "b 4 4"]
+    K_crop: Float[Array, "b 3 3"]
+    scene_contour_m: Float[Array, "b n 3"]
+    hypothesis_contour_m: Float[Array, "b n 3"]
+    scene_distance_px: Float[Array, "b p p"]
+    hypothesis_distance_px: Float[Array, "b p p"]
+    obj_id: Array
+    kept: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Draft:
+    """A pair before its hypothesis is rendered."""
+
+    index: int
+    sample: Mapping[str, Any]
+    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj_hypothesis: Float[Array, "4 4"]
+    K_crop: Float[Array, "3 3"]
+    turn: Float[Array, "3 3"]
+    patch_from_stored: Float[Array, "2 3"]
+    scene_distance_px: Float[Array, "p p"]
+    valid: Bool[Array, "p p"]
+
+
+def draw_hypothesis(
+    T_cam_obj: Float[Array, "4 4"],
+    diameter_m: float,
+    config: HypothesisConfig,
+    rng: np.random.Generator,
+    reach: float = 1,
+) -> Float[Array, "4 4"]:
+    """A pose near the truth: angle and distance uniform up to the configured ends, axis and direction uniform.
+
+    Args:
+        T_cam_obj: Truth.
+        diameter_m: Of the object.
+        config: Ends of the ranges.
+        rng: Source of every draw.
+        reach: Factor on both ends.
+    """
+    if rng.random() < config.easy_share:
+        reach = reach * rng.random()
+    angle_rad = np.deg2rad(config.max_angle_deg) * reach * rng.random()
+    distance_m = config.max_translation_diameter * diameter_m * reach * rng.random()
+    return se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
+
+
+def optical_axis_turn(angle_rad: float) -> Float[Array, "3 3"]:
+    """Rotation of the scene about the camera's optical axis."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def recut_affine(
+    stored: Window, stored_px: int, K: Float[Array, "3 3"], turn: Float[Array, "3 3"], window: Window, patch_px: int
+) -> Float[Array, "2 3"]:
+    """Affine map from the stored patch's pixels to the new patch's, both continuous (pixel centre at + 0.5).
+
+    Args:
+        stored: Window the stored patch was cut with.
+        stored_px: Its side in its own pixels.
+        K: Camera of the full image.
+        turn: Rotation about the optical axis, see `optical_axis_turn`.
+        window: New window, in the image that the turned camera sees.
+        patch_px: Side of the new patch.
+    """
+    image_from_stored = _similarity(stored.side_px / stored_px, stored.x0_px, stored.y0_px)
+    scale = patch_px / window.side_px
+    patch_from_image = _similarity(scale, -window.x0_px * scale, -window.y0_px * scale)
+    return np.asarray((patch_from_image @ K @ turn @ np.linalg.inv(K) @ image_from_stored)[:2])
+
+
+def _similarity(scale: float, dx: float, dy: float) -> Float[Array, "3 3"]:
+    return np.array([[scale, 0.0, dx], [0.0, scale, dy], [0.0, 0.0, 1.0]])
+
+
+def warp(image: Array, affine: Float[Array, "2 3"], patch_px: int, nearest: bool = False) -> Array:
+    """Resample an image by a continuous-pixel affine map; zero outside.
+
+    Colours are blurred first where the map shrinks them, by as much as `posecore.window.cut` blurs with "area".
+    """
+    shrink = 1.0 / float(np.sqrt(abs(np.linalg.det(affine[:, :2]))))
+    if not nearest and shrink > 1.2:
+        image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(shrink**2 - 1), borderType=cv2.BORDER_REPLICATE)
+    centred = affine.copy()
+    centred[:, 2] += 0.5 * affine[:, :2].sum(axis=1) - 0.5  # cv2 counts pixel centres as integers
+    flags = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
+    return np.asarray(cv2.warpAffine(image, centred, (patch_px, patch_px), flags=flags))
+
+
+class PairMaker:
+    """Makes batches of pairs with diameter windows out of stored scenes.
+
+    Args:
+        meshes: By object id.
+        rasteriser: Draws them; made in the process that uses it.
+        patch_px: Side of the new patches.
+        window_scale: Side of the window in projected diameters.
+        contour_points: Contour points of each patch.
+        hypothesis: How hypotheses are drawn; with `fresh` off, the stored ones are taken.
+        augment_config: Colour augmentation.
+    """
+
+    def __init__(
+        self,
+        *,
+        meshes: Mapping[int, Mesh],
+        rasteriser: Rasteriser,
+        patch_px: int,
+        window_scale: float,
+        contour_points: int,
+        hypothesis: HypothesisConfig,
+        augment_config: AugmentConfig,
+    ) -> None:
+        self._meshes = meshes
+        self._rasteriser = rasteriser
+        self._patch_px = patch_px
+        self._window_scale = window_scale
+        self._contour_points = contour_points
+        self._hypothesis = hypothesis
+        self._augment = augment_config
+
+    def __call__(self, samples: Sequence[Mapping[str, Any]], rngs: Sequence[np.random.Generator]) -> PairArrays | None:
+        """Pairs of these samples, each drawn with its own generator; None when no object can be seen in any of them.
+
+        Args:
+            samples: Rows of a shard: scene_rgb, scene_mask, scene_contour_cam_m, T_cam_obj, K, window_px, obj_id and,
+                without fresh hypotheses, T_cam_obj_hypothesis.
+            rngs: As many.
+        """
+        drafts = [d for i, (s, rng) in enumerate(zip(samples, rngs, strict=True)) if (d := self._draft(i, s, rng))]
+        rgb, depth = self._render(drafts)
+        masks = [contour.contour_mask(d > 0) for d in depth]
+        seen = [i for i, mask in enumerate(masks) if mask.sum() >= MIN_CONTOUR_PX]
+        if not seen:
+            return None
+        seen += [seen[i % len(seen)] for i in range(len(samples) - len(seen))]
+        drafts = [drafts[i] for i in seen]
+        scenes = np.stack([self._scene(d, samples, rngs[d.index]) for d in drafts])
+        scene_rgb, hypothesis_rgb = augment.colour(scenes, rgb[seen], self._augment, rngs[drafts[0].index])
+        points = [
+            contour.sample_contour(depth[i] > 0, depth[i], d.K_crop, self._contour_points, rngs[d.index])
+            for i, d in zip(seen, drafts, strict=True)
+        ]
+        return PairArrays(
+            scene_rgb=scene_rgb,
+            hypothesis_rgb=hypothesis_rgb,
+            T_cam_obj=np.stack([d.T_cam_obj for d in drafts]),
+            T_cam_obj_hypothesis=np.stack([d.T_cam_obj_hypothesis for d in drafts]),
+            K_crop=np.stack([d.K_crop for d in drafts]),
+            scene_contour_m=np.stack([self._scene_points(d) for d in drafts]),
+            hypothesis_contour_m=np.stack(points),
+            scene_distance_px=np.stack([d.scene_distance_px for d in drafts]),
+            hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
+            obj_id=np.array([int(d.sample["obj_id"]) for d in drafts]),
+            kept=np.array([d.index for d in drafts]),
+        )
+
+    def _draft(self, index: int, sample: Mapping[str, Any], rng: np.random.Generator) -> _Draft | None:
+        """Pose, window and scene labels of one pair; None when the scene's contour cannot be seen in any window."""
+        mesh = self._meshes[int(sample["obj_id"])]
+        in_plane = self._hypothesis.fresh and self._hypothesis.in_plane
+        turn = optical_axis_turn(rng.uniform(-np.pi, np.pi) if in_plane else 0.0)
+        T_turn = se3.make_T(turn, np.zeros(3))
+        truth = T_turn @ sample["T_cam_obj"]
+        x0, y0, side = (float(v) for v in sample["window_px"])
+        stored, stored_px = Window(x0_px=x0, y0_px=y0, side_px=side), len(sample["scene_rgb"])
+        for attempt in range(ATTEMPTS):
+            if self._hypothesis.fresh:
+                guess = draw_hypothesis(truth, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
+            else:
+                guess = T_turn @ sample["T_cam_obj_hypothesis"]
+            if (guess[:3, :3] @ mesh.center_m + guess[:3, 3])[2] < mesh.diameter_m:
+                continue
+            window = diameter_window(sample["K"], guess, mesh.center_m, mesh.diameter_m, self._window_scale)
+            affine = recut_affine(stored, stored_px, sample["K"], turn, window, self._patch_px)
+            bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
+            valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
+            # Where the stored patch ends the silhouette is cut, which is no contour: outside counts as object.
+            outline = contour.contour_mask(((bits & OBJECT) > 0) | ~valid) & valid
+            if outline.sum() >= MIN_CONTOUR_PX:
+                return _Draft(
+                    index=index,
+                    sample=sample,
+                    T_cam_obj=truth,
+                    T_cam_obj_hypothesis=guess,
+                    K_crop=crop_K(sample["K"], window, self._patch_px),
+                    turn=turn,
+                    patch_from_stored=affine,
+                    scene_distance_px=contour.distance_transform_px(outline),
+                    valid=valid,
+                )
+        return None
+
+    def _render(self, drafts: Sequence[_Draft]) -> tuple[UInt8[Array, "b p p 3"], Float[Array, "b p p"]]:
+        p = self._patch_px
+        rgb, depth = np.zeros((len(drafts), p, p, 3), np.uint8), np.zeros((len(drafts), p, p), np.float32)
+        ids = np.array([int(d.sample["obj_id"]) for d in drafts])
+        for obj_id in np.unique(ids):
+            rows = np.flatnonzero(ids == obj_id)
+            K = np.stack([drafts[i].K_crop for i in rows])
+            T = np.stack([drafts[i].T_cam_obj_hypothesis for i in rows])
+            layers = self._rasteriser.render(int(obj_id), K, T, p, p)
+            rgb[rows], depth[rows] = layers.rgb, layers.depth_m
+        return rgb, depth
+
+    def _scene(
+        self, draft: _Draft, samples: Sequence[Mapping[str, Any]], rng: np.random.Generator
+    ) -> UInt8[Array, "p p 3"]:
+        scene = warp(draft.sample["scene_rgb"], draft.patch_from_stored, self._patch_px)
+        exchange = rng.random() < self._augment.background
+        if not exchange and draft.valid.all():
+            return scene
+        other = samples[int(rng.integers(len(samples)))]
+        behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & FOREGROUND) > 0, self._patch_px, rng)
+        keep = draft.valid
+        if exchange:
+            bits = warp(draft.sample["scene_mask"], draft.patch_from_stored, self._patch_px, nearest=True)
+            keep = keep & ((bits & FOREGROUND) > 0)
+        # The stored window's edge must not show: it was centred near the truth and would give the answer away.
+        return np.where(keep[..., None], scene, behind)
+
+    def _scene_points(self, draft: _Draft) -> Float[Array, "n 3"]:
+        points = draft.sample["scene_contour_cam_m"]
+        chosen = (np.arange(self._contour_points) * len(points)) // self._contour_points
+        return np.asarray(points[chosen] @ draft.turn.T.astype(points.dtype))

@@ -1,0 +1,121 @@
+"""Pose errors of a network on held-out pairs, and the log that metrics are written to."""
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from posecore.errors import ConfigError
+from torch import Tensor, nn
+from torch.utils.tensorboard import SummaryWriter
+
+from refinenet import geometry
+from refinenet.data import Batch
+from refinenet.loss import ObjectPoints
+
+
+def pose_errors(
+    T_cam_obj: Float[Tensor, "b 4 4"],
+    T_true: Float[Tensor, "b 4 4"],
+    object_index: Tensor,
+    objects: ObjectPoints,
+) -> dict[str, Float[Tensor, " b"]]:
+    """Errors of each pose: rotation_deg, x_mm, y_mm, z_mm (absolute), add_mm (mean point distance).
+
+    Rotation and point distance are minimised over the object's symmetries.
+    """
+    wanted = T_true[:, None] @ objects.symmetries[object_index]
+    valid = objects.valid[object_index]
+    b, s = valid.shape
+    difference = T_cam_obj[:, None, :3, :3] @ wanted[..., :3, :3].transpose(-1, -2)
+    angle = geometry.rotation_angle_deg(difference.reshape(b * s, 3, 3)).reshape(b, s)
+    points = objects.points_m[object_index]
+    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2) + T_cam_obj[:, None, :3, 3]
+    true = torch.einsum("bsij,bmj->bsmi", wanted[..., :3, :3], points) + wanted[:, :, None, :3, 3]
+    distance = torch.linalg.vector_norm(got[:, None] - true, dim=-1).mean(-1)
+    move_mm = 1e3 * (T_cam_obj[:, :3, 3] - T_true[:, :3, 3]).abs()
+    return {
+        "rotation_deg": angle.masked_fill(~valid, torch.inf).amin(-1),
+        "x_mm": move_mm[:, 0],
+        "y_mm": move_mm[:, 1],
+        "z_mm": move_mm[:, 2],
+        "add_mm": 1e3 * distance.masked_fill(~valid, torch.inf).amin(-1),
+    }
+
+
+@torch.no_grad()
+def measure(
+    network: nn.Module, batches: Iterable[Batch], objects: ObjectPoints, device: torch.device
+) -> dict[str, float]:
+    """Errors before and after one update: mean of each, and the rotation's median.
+
+    Keys: validation/rotation_before_deg, validation/rotation_after_deg, validation/rotation_median_after_deg,
+    validation/x_before_mm and so on.
+    """
+    was_training = network.training
+    network.eval()
+    collected: dict[str, list[Tensor]] = {}
+    for batch in batches:
+        batch = batch.to(device)
+        start = batch.pair.T_cam_obj
+        for when, pose in (("before", start), ("after", geometry.apply_update(start, network(batch.pair)))):
+            errors = pose_errors(pose, batch.target.T_cam_obj, batch.target.object_index, objects)
+            for name, values in errors.items():
+                what, unit = name.rsplit("_", 1)
+                collected.setdefault(f"validation/{what}_{when}_{unit}", []).append(values.cpu())
+    network.train(was_training)
+    joined = {key: torch.cat(values).double() for key, values in collected.items()}
+    result = {key: float(values.mean()) for key, values in joined.items()}
+    for when in ("before", "after"):
+        result[f"validation/rotation_median_{when}_deg"] = float(
+            joined[f"validation/rotation_{when}_deg"].quantile(0.5)
+        )
+    return result
+
+
+class MetricLog:
+    """Appends metrics to `metrics.jsonl` and to TensorBoard event files in one folder.
+
+    Args:
+        folder: Of the run.
+        start: Lines of later steps, left by a run that was killed after its last checkpoint, are dropped.
+    """
+
+    def __init__(self, folder: Path, start: int) -> None:
+        self._path = folder / "metrics.jsonl"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            kept = [line for line in self._lines() if line["step"] <= start]
+            self._path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from error
+        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=start + 1)
+
+    def _lines(self) -> list[dict[str, Any]]:
+        if not self._path.is_file():
+            return []
+        lines = []
+        for text in self._path.read_text().splitlines():
+            try:
+                lines.append(json.loads(text))
+            except ValueError:  # the line a killed run was writing
+                break
+        return lines
+
+    def write(self, step: int, values: Mapping[str, float]) -> None:
+        """One line of metrics of a step; units are in the keys."""
+        with self._path.open("a") as stream:
+            stream.write(json.dumps({"step": step, **values}) + "\n")
+        for key, value in values.items():
+            self._writer.add_scalar(key, value, step)
+
+    def __enter__(self) -> "MetricLog":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.close()

@@ -1,0 +1,85 @@
+"""A dataset's objects: meshes for the rasteriser, points and symmetries for the point loss and the metrics."""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
+from posecore.mesh import Mesh, load_mesh
+from posecore.shard import ShardReader
+
+from refinenet.loss import ObjectPoints
+
+
+def object_ids(reader: ShardReader) -> list[int]:
+    """Objects of the data card, sorted."""
+    return sorted(int(key) for key in reader.card["objects"])
+
+
+def load_meshes(reader: ShardReader) -> dict[int, Mesh]:
+    """The meshes that the dataset carries in `models/`, by object id.
+
+    Raises:
+        ShardError: One is missing.
+        MeshError: One cannot be read.
+    """
+    meshes = {}
+    with tempfile.TemporaryDirectory() as folder:  # a dataset behind a URL has no paths to load from
+        for obj_id in object_ids(reader):
+            name = f"obj_{obj_id:06d}.ply"
+            copy = Path(folder) / name
+            copy.write_bytes(reader.file(f"models/{name}"))
+            meshes[obj_id] = load_mesh(copy, units="mm")
+    return meshes
+
+
+def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
+    """Diameters and symmetries that the dataset carries in `models/models_info.json`.
+
+    Raises:
+        ShardError: The file is missing.
+        DatasetError: It is not valid.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "models_info.json"
+        copy.write_bytes(reader.file("models/models_info.json"))
+        return load_models_info(copy)
+
+
+def object_points(
+    meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], n_points: int, step_deg: float
+) -> ObjectPoints:
+    """Vertices spread over each object by farthest-point sampling, and its symmetries, padded to one shape.
+
+    Args:
+        meshes: By object id; rows follow the sorted ids.
+        models: Symmetries by object id; an object that is not there has none.
+        n_points: Points of each object.
+        step_deg: Step at which continuous symmetries are sampled.
+    """
+    points, transforms = [], []
+    for obj_id, mesh in sorted(meshes.items()):
+        points.append(farthest_points(mesh.vertices_m, n_points))
+        known = models.get(obj_id)
+        identity = np.eye(4)[None]
+        transforms.append(identity if known is None else symmetry_transforms(known, max_step_rad=np.deg2rad(step_deg)))
+    width = max(len(S) for S in transforms)
+    padded = [np.concatenate([S, np.tile(np.eye(4), (width - len(S), 1, 1))]) for S in transforms]
+    valid = np.stack([np.arange(width) < len(S) for S in transforms])
+    return ObjectPoints(
+        torch.from_numpy(np.stack(points).astype(np.float32)),
+        torch.from_numpy(np.stack(padded).astype(np.float32)),
+        torch.from_numpy(valid),
+    )
+
+
+def farthest_points(vertices_m: np.ndarray, n: int) -> np.ndarray:
+    """(n, 3) vertices, each the farthest from those before; repeats where the mesh has fewer."""
+    chosen = [int(np.argmax(np.linalg.norm(vertices_m - vertices_m.mean(axis=0), axis=1)))]
+    distance = np.full(len(vertices_m), np.inf)
+    for _ in range(n - 1):
+        distance = np.minimum(distance, np.linalg.norm(vertices_m - vertices_m[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.asarray(vertices_m[chosen])

@@ -1,0 +1,64 @@
+"""Pairs exactly as shards hold them, for networks that look through the shard's own fixed window."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from posecore.errors import ConfigError
+
+from refinenet import augment
+from refinenet.config import AugmentConfig, TrainConfig
+from refinenet.hypothesis import PairArrays
+
+STORED_FIELDS = (
+    "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
+    "hypothesis_contour_cam_m", "scene_distance_px", "hypothesis_distance_px", "scene_mask", "obj_id",
+)  # fmt: skip
+
+
+def stored_pairs(
+    samples: Sequence[Mapping[str, Any]],
+    rngs: Sequence[np.random.Generator],
+    config: TrainConfig,
+    augment_config: AugmentConfig,
+    where: str,
+) -> PairArrays:
+    """Stack samples into a batch; contour points are thinned evenly to the configured number.
+
+    Raises:
+        ConfigError: The shards' patches are not of the network's size, or hold fewer contour points than asked for.
+    """
+    stored_px, wanted_px = len(samples[0]["scene_rgb"]), config.network.patch_px
+    if stored_px != wanted_px:
+        raise ConfigError(
+            f"{where}: patches of {stored_px} px, preset {config.preset} expects {wanted_px}; "
+            f"render with --set patch_px={wanted_px}"
+        )
+    stored, n = len(samples[0]["scene_contour_cam_m"]), config.loss.contour_points
+    if n > stored:
+        raise ConfigError(f"{where}: {stored} contour points, loss.contour_points is {n}; set it to {stored} or less")
+    thin = (np.arange(n) * stored) // n
+
+    def stack(name: str) -> np.ndarray:
+        return np.stack([sample[name] for sample in samples])
+
+    scenes = stack("scene_rgb")
+    for i, (sample, rng) in enumerate(zip(samples, rngs, strict=True)):
+        if rng.random() < augment_config.background:
+            other = samples[int(rng.integers(len(samples)))]
+            behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & 4) > 0, stored_px, rng)
+            scenes[i] = np.where((sample["scene_mask"] & 4)[..., None] > 0, scenes[i], behind)
+    scene_rgb, hypothesis_rgb = augment.colour(scenes, stack("hypothesis_rgb"), augment_config, rngs[0])
+    return PairArrays(
+        scene_rgb=scene_rgb,
+        hypothesis_rgb=hypothesis_rgb,
+        T_cam_obj=stack("T_cam_obj"),
+        T_cam_obj_hypothesis=stack("T_cam_obj_hypothesis"),
+        K_crop=stack("K_crop"),
+        scene_contour_m=stack("scene_contour_cam_m")[:, thin],
+        hypothesis_contour_m=stack("hypothesis_contour_cam_m")[:, thin],
+        scene_distance_px=stack("scene_distance_px"),
+        hypothesis_distance_px=stack("hypothesis_distance_px"),
+        obj_id=stack("obj_id"),
+        kept=np.arange(len(samples)),
+    )

@@ -1,0 +1,101 @@
+"""From an OpenCV pinhole camera and a region of its pixel plane to Blender's camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from posecore.camera import Camera, project
+
+SENSOR_WIDTH_MM = 36.0  # any width serves: Blender keeps only the ratio of lens to sensor
+MIN_SIDE_PX = 4  # Blender raises a smaller resolution to this in silence
+FILTER_REACH_PX = 2  # no less than half the pixel filter: how far an object's edge colours pixels around it
+NEAREST_M = 0.01
+
+Region = tuple[int, int, int, int]
+
+# The camera frame is the world frame, and Blender's camera at the origin looks along -z with y up: x stays, y and z
+# change sign. This is the only place where axes are converted.
+_BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def blender_from_opencv(T_cam_x: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+    """Return Blender's world matrix of a thing (object or lamp) whose pose in the OpenCV camera frame is given.
+
+    Args:
+        T_cam_x: Pose in the OpenCV camera frame, metres.
+    """
+    return np.asarray(_BLENDER_FROM_OPENCV @ T_cam_x)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlenderLens:
+    """Settings of Blender's render and camera, with the sensor fit 'HORIZONTAL'.
+
+    Attributes:
+        width_px: Render width.
+        height_px: Render height.
+        pixel_aspect_x: Width of a pixel; at least 1, as Blender demands.
+        pixel_aspect_y: Height of a pixel; at least 1.
+        lens_mm: Focal length over a sensor of SENSOR_WIDTH_MM.
+        shift_x: To the right, in render widths.
+        shift_y: Upwards, in render widths too (not heights), of pixels as wide as they are.
+    """
+
+    width_px: int
+    height_px: int
+    pixel_aspect_x: float
+    pixel_aspect_y: float
+    lens_mm: float
+    shift_x: float
+    shift_y: float
+
+
+def lens_of(camera: Camera, region_px: Region) -> BlenderLens:
+    """Return the lens that sees exactly the region's pixels, which may lie outside the image.
+
+    The principal point is in the project's continuous pixel coordinates; Blender's viewplane runs from edge to edge
+    of the pixels as well, so no half pixel is added anywhere.
+
+    Args:
+        camera: Pinhole camera; fx may differ from fy.
+        region_px: x0, y0, width, height. A side under MIN_SIDE_PX is extended right or down.
+    """
+    x0, y0, width, height = region_px
+    width, height = max(width, MIN_SIDE_PX), max(height, MIN_SIDE_PX)
+    fx, fy = float(camera.K[0, 0]), float(camera.K[1, 1])
+    cx, cy = float(camera.K[0, 2]) - x0, float(camera.K[1, 2]) - y0
+    # A pixel's physical size is inverse to its focal length in pixels.
+    aspect_x, aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
+    return BlenderLens(
+        width_px=width,
+        height_px=height,
+        pixel_aspect_x=aspect_x,
+        pixel_aspect_y=aspect_y,
+        lens_mm=fx * SENSOR_WIDTH_MM / width,
+        shift_x=(width / 2 - cx) / width,
+        shift_y=(cy - height / 2) / width * (aspect_y / aspect_x),
+    )
+
+
+def occupied_region(camera: Camera, region_px: Region, corners_cam_m: Float[np.ndarray, "n 8 3"]) -> Region | None:
+    """Return the part of the region that objects can reach, or None where they reach none of it.
+
+    An empty pixel is a third of the work of a full one, and crops around small or distant objects are mostly empty.
+
+    Args:
+        camera: Pinhole camera.
+        region_px: x0, y0, width, height.
+        corners_cam_m: Corners of each object's bounding box. One that stands behind the camera or in it makes no bound,
+            so then the region itself is returned.
+    """
+    corners = corners_cam_m.reshape(-1, 3)
+    if (corners[:, 2] < NEAREST_M).any():
+        return region_px
+    uv = project(camera.K, corners)
+    x0, y0, width, height = region_px
+    low = np.maximum(np.floor(uv.min(axis=0)) - FILTER_REACH_PX, (x0, y0))
+    high = np.minimum(np.ceil(uv.max(axis=0)) + FILTER_REACH_PX, (x0 + width, y0 + height))
+    if (low >= high).any():
+        return None
+    (left, top), (right, bottom) = low.astype(int).tolist(), high.astype(int).tolist()
+    return left, top, right - left, bottom - top

@@ -1,0 +1,111 @@
+"""Render settings of Cycles and EEVEE for small pictures: everything that costs time per picture is off."""
+
+import bpy
+from posecore.errors import RenderError
+
+from synthgen.blender.materials import INDEX_AOV
+
+ENGINE_IDS = {"cycles": "CYCLES", "eevee": "BLENDER_EEVEE_NEXT"}
+COLOUR_FILTER_PX = 1.5
+GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
+
+
+def set_common(scene: bpy.types.Scene, *, engine: str, threads: int) -> None:
+    """Set what both engines share: linear float EXR with alpha, no post-processing.
+
+    Args:
+        scene: Blender's scene.
+        engine: 'cycles' or 'eevee'.
+        threads: Threads to render with, 0 for all cores.
+    """
+    render = scene.render
+    render.engine = ENGINE_IDS[engine]
+    render.use_persistent_data = True
+    render.film_transparent = True
+    render.filter_size = COLOUR_FILTER_PX
+    render.resolution_percentage = 100
+    render.use_file_extension = False
+    render.use_overwrite = True
+    render.use_compositing = False
+    render.use_sequencer = False
+    render.use_motion_blur = False
+    render.dither_intensity = 0.0
+    render.threads_mode = "FIXED" if threads else "AUTO"
+    if threads:
+        render.threads = threads
+    image = render.image_settings
+    image.file_format = "OPEN_EXR_MULTILAYER"
+    image.color_mode = "RGBA"
+    image.color_depth = "32"
+    image.exr_codec = "NONE"
+    scene.view_settings.view_transform = "Raw"
+    scene.view_settings.look = "None"
+    scene.view_layers[0].use_pass_combined = True
+    scene.view_layers[0].use_pass_z = True
+
+
+def set_cycles(scene: bpy.types.Scene, *, device: str) -> None:
+    """Set Cycles to few samples and short paths, with the same result on any number of threads.
+
+    Args:
+        scene: Blender's scene.
+        device: 'cpu' or 'gpu'.
+
+    Raises:
+        RenderError: 'gpu' and Cycles finds none.
+    """
+    scene.view_layers[0].use_pass_object_index = True
+    cycles = scene.cycles
+    cycles.device = "CPU"
+    if device == "gpu":
+        _use_gpu()
+        cycles.device = "GPU"
+    # Samples are few and equal everywhere: an adaptive or denoised pixel costs more here than another sample.
+    cycles.use_adaptive_sampling = False
+    cycles.use_denoising = False
+    cycles.use_auto_tile = False
+    cycles.use_light_tree = False
+    cycles.use_guiding = False
+    # The automatic pattern (blue noise) keeps its length from the first render on, so a picture would depend on what
+    # was rendered before it with another number of samples.
+    cycles.sampling_pattern = "TABULATED_SOBOL"
+    cycles.pixel_filter_type = "BLACKMAN_HARRIS"
+    cycles.filter_width = COLOUR_FILTER_PX
+    cycles.max_bounces = 2
+    cycles.diffuse_bounces = 1
+    cycles.glossy_bounces = 2
+    cycles.transmission_bounces = 0
+    cycles.volume_bounces = 0
+    cycles.transparent_max_bounces = 0
+    cycles.caustics_reflective = False
+    cycles.caustics_refractive = False
+    cycles.sample_clamp_direct = 0.0
+    cycles.sample_clamp_indirect = 4.0  # fireflies: one lucky path in a handful would stay as a white dot
+    cycles.debug_use_spatial_splits = False
+
+
+def set_eevee(scene: bpy.types.Scene) -> None:
+    """Set EEVEE to shadows and nothing that depends on the screen or on baked light.
+
+    EEVEE has no object index pass; every material writes the index to an output variable instead.
+    """
+    scene.eevee.use_shadows = True  # a new scene starts without
+    scene.eevee.use_raytracing = False
+    scene.eevee.use_taa_reprojection = False
+    variable = scene.view_layers[0].aovs.add()
+    variable.name, variable.type = INDEX_AOV, "VALUE"
+
+
+def _use_gpu() -> None:
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in GPU_KINDS:
+        try:
+            devices = preferences.get_devices_for_type(kind)
+        except (TypeError, ValueError):  # a kind that this build of Blender does not know
+            continue
+        if any(device.type == kind for device in devices):
+            preferences.compute_device_type = kind
+            for device in devices:
+                device.use = device.type == kind
+            return
+    raise RenderError(f"device gpu: Cycles finds no device of {', '.join(GPU_KINDS)}; use the device cpu")

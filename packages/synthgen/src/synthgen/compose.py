@@ -1,0 +1,24 @@
+"""Rendered layers, background and sensor put together to the bytes of an image."""
+
+import numpy as np
+from jaxtyping import UInt8
+
+from synthgen import background, sensor
+from synthgen.engine import RenderedScene
+from synthgen.scene import Scene
+
+Array = np.ndarray
+
+
+def compose(rendered: RenderedScene, scene: Scene) -> UInt8[Array, "h w 3"]:
+    """Lay the render over the scene's background in linear light and expose it."""
+    height, width = rendered.alpha.shape
+    behind = sensor.linear_from_display(background.draw(scene.background, width, height))
+    alpha = rendered.alpha[..., None]
+    return sensor.expose(rendered.rgb_linear * alpha + behind * (1 - alpha), scene.sensor)
+
+
+def on_black(rendered: RenderedScene) -> UInt8[Array, "h w 3"]:
+    """The render alone on black, in display values: a hypothesis."""
+    display = sensor.display_from_linear(rendered.rgb_linear * rendered.alpha[..., None])
+    return np.asarray((display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8))

@@ -1,0 +1,119 @@
+"""A dataset's card and the files that lie beside its shards."""
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from posecore import config as config_tools
+from posecore.bop import ModelInfo, load_models_info, write_models
+from posecore.errors import ConfigError, DatasetError
+from posecore.files import sha256_bytes, sha256_file
+from posecore.mesh import Mesh
+
+from synthgen.config import SynthConfig
+from synthgen.target import make_target
+
+# What decides the bytes of a sample beside the project itself.
+_PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "zarr", "moderngl", "trimesh")
+_UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
+# Depth is stored in steps of 0.1 mm in 16 bits.
+MAX_DEPTH_M = 6.5535
+_DEPTH_BEHIND_DIAMETER = 4.0  # how far behind the object its props reach
+
+
+def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: Sequence[str]) -> dict[str, Any]:
+    """The data card: nothing in it depends on time, machine or number of workers.
+
+    Raises:
+        ConfigError: n is not positive, or the distances do not suit an object.
+    """
+    if n < 1:
+        raise ConfigError(f"--n {n}: expected at least 1 sample")
+    targets = [make_target(obj_id, mesh, config) for obj_id, mesh in sorted(meshes.items())]
+    for target in targets:
+        reach = target.distance_m[1] + _DEPTH_BEHIND_DIAMETER * target.mesh.diameter_m
+        if reach > MAX_DEPTH_M:
+            raise ConfigError(
+                f"{target.name}: its scenes reach {reach:.2f} m deep and shards hold at most {MAX_DEPTH_M} m; "
+                "lower distance.min and distance.max (in diameters, or in metres with --set distance.unit=m)"
+            )
+    camera = config.camera
+    return {
+        "n": n,
+        "shard_size": config.shard_size,
+        "patch_px": config.patch_px,
+        "contour_points": config.contour_points,
+        "seed": config.seed,
+        "config": config_tools.to_dict(config),
+        "objects": {
+            str(t.obj_id): {
+                "name": t.name,
+                "path": f"models/obj_{t.obj_id:06d}.ply",
+                "sha256": t.mesh.sha256,
+                "diameter_m": t.mesh.diameter_m,
+                "window_side_px": t.window_side_px,
+            }
+            for t in targets
+        },
+        "camera": config_tools.to_dict(camera),
+        "backgrounds": {"photos": len(photos), "sha256": _photos_hash(photos)} if photos else None,
+        "units": _UNITS,
+        "versions": _versions(config),
+    }
+
+
+def model_files(meshes: Mapping[int, Mesh], infos: Mapping[int, ModelInfo]) -> dict[str, bytes]:
+    """The meshes in BOP's layout, as bytes by key, so that a dataset can be trained on without the original files."""
+    with TemporaryDirectory() as folder:
+        write_models(folder, meshes, infos)
+        return {f"models/{p.name}": p.read_bytes() for p in sorted((Path(folder) / "models").iterdir())}
+
+
+def load_symmetries(path: str | None, meshes: Mapping[int, Mesh]) -> dict[int, ModelInfo]:
+    """Symmetries of the objects from a `models_info.json` whose keys are object ids or the meshes' file names.
+
+    Raises:
+        DatasetError: The file is missing or broken, or knows none of the objects.
+    """
+    if path is None:
+        return {}
+    by_stem = {Path(mesh.path).stem: obj_id for obj_id, mesh in meshes.items()}
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{path}: cannot be read as JSON; give a BOP models_info.json") from error
+    with TemporaryDirectory() as folder:
+        numbered = Path(folder) / "models_info.json"
+        entries = {
+            str(by_stem.get(key, key)): entry for key, entry in content.items() if key in by_stem or key.isdigit()
+        }
+        if not entries:
+            raise DatasetError(f"{path}: no entry for {', '.join(sorted(by_stem))}; its keys are {', '.join(content)}")
+        numbered.write_text(json.dumps(entries), encoding="utf-8")
+        infos = load_models_info(numbered)
+    return {obj_id: info for obj_id, info in infos.items() if obj_id in meshes}
+
+
+def estimated_bytes(config: SynthConfig, n: int) -> int:
+    """Rough size of a dataset on disk, from measured sizes of compressed samples (about 4 bytes a patch pixel)."""
+    return n * (4 * config.patch_px**2 + 24 * config.contour_points)
+
+
+def _photos_hash(photos: Sequence[str]) -> str:
+    return sha256_bytes("".join(sha256_file(p) for p in photos).encode())
+
+
+def _versions(config: SynthConfig) -> dict[str, str]:
+    names = list(_PACKAGES)
+    if {config.engine, config.hypothesis_engine} & {"cycles", "eevee"}:
+        names.append("bpy")
+    found = {}
+    for name in names:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:  # a checkout on the path
+            found[name] = "unknown"
+    return found

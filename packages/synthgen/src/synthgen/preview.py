@@ -1,0 +1,124 @@
+"""Contact sheets: what the samples of a dataset look like, with their labels drawn over them."""
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from posecore.camera import project
+from posecore.contour import contour_mask
+from posecore.errors import ShardError
+from posecore.shard import ShardReader
+
+from synthgen.pair import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
+
+Array = np.ndarray
+Image = UInt8[Array, "h w 3"]
+
+CELL_PX = 256
+_CAPTION_PX = 22
+_TITLES = (
+    "scene, contour of truth (green) and hypothesis (red)",
+    "hypothesis and its contour",
+    "distance to true contour",
+    "distance to hypothesis contour",
+    "visible, hidden, other",
+    "scene depth",
+)
+_GREEN, _RED = (60, 255, 60), (255, 60, 60)
+
+
+def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
+    """Draw samples of a dataset, one row each.
+
+    Args:
+        url: Shard dataset, complete or growing.
+        count: Rows at most.
+        first: Index of the first sample.
+
+    Raises:
+        ShardError: Nothing to show.
+    """
+    reader = ShardReader(url)
+    rows = []
+    for shard_id in reader.committed:
+        start = shard_id * reader.shard_size
+        stop = start + reader.n_samples(shard_id)
+        wanted = range(max(first, start), min(stop, first + count))
+        if not wanted:
+            continue
+        samples = reader.read(shard_id)
+        rows += [_row({k: v[i - start] for k, v in samples.items()}, i) for i in wanted]
+    if not rows:
+        raise ShardError(f"{url}: no rendered sample from {first} on; there are {len(reader.committed)} shards so far")
+    return np.concatenate([_titles(), *rows])
+
+
+def _row(sample: Mapping[str, Array], index: int) -> Image:
+    K = sample["K_crop"]
+    scale = CELL_PX / sample["scene_rgb"].shape[0]
+    uv_scene = project(K, sample["scene_contour_cam_m"].astype(np.float64)) * scale
+    uv_hypothesis = project(K, sample["hypothesis_contour_cam_m"].astype(np.float64)) * scale
+    limit = max(1.0, float(np.percentile(sample["scene_distance_px"], 98)))
+    cells = [
+        _dots(_dots(_enlarge(sample["scene_rgb"]), uv_hypothesis, _RED), uv_scene, _GREEN),
+        _dots(_enlarge(sample["hypothesis_rgb"]), uv_hypothesis, _RED),
+        _enlarge(_colour_mapped(sample["scene_distance_px"], 0.0, limit)),
+        _enlarge(_colour_mapped(sample["hypothesis_distance_px"], 0.0, limit)),
+        _enlarge(_mask_colours(sample["scene_mask"])),
+        _enlarge(_depth_colours(sample["scene_depth_m"])),
+    ]
+    turn = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
+    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    moved = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
+    caption = (
+        f"sample {index}  scene {sample['scene_index']}  object {sample['obj_id']}  hypothesis off by {angle:.1f} deg, "
+        f"{moved:.1f} mm  visible {sample['visible_fraction']:.2f}  rejected {sample['rejected']}"
+    )
+    return np.concatenate([np.concatenate(cells, axis=1), _strip([caption], len(cells))])
+
+
+def _enlarge(image: Image) -> UInt8[Array, "cell cell 3"]:
+    return np.asarray(cv2.resize(image, (CELL_PX, CELL_PX), interpolation=cv2.INTER_NEAREST))
+
+
+def _dots(image: Image, uv_px: Float[Array, "n 2"], colour: tuple[int, int, int]) -> Image:
+    """Dots at continuous image coordinates; OpenCV counts pixel centres as whole numbers, in 1/16 px here."""
+    image = np.ascontiguousarray(image)
+    for u, v in np.rint((uv_px - 0.5) * 16).astype(int):
+        cv2.circle(image, (int(u), int(v)), 16, colour, -1, cv2.LINE_AA, shift=4)
+    return image
+
+
+def _colour_mapped(values: Float[Array, "h w"], low: float, high: float) -> Image:
+    grey = (np.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
+    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)[..., ::-1])
+
+
+def _depth_colours(depth_m: Float[Array, "h w"]) -> Image:
+    hit = depth_m > 0
+    low, high = (float(depth_m[hit].min()), float(depth_m[hit].max())) if hit.any() else (0.0, 1.0)
+    return np.where(hit[..., None], _colour_mapped(-depth_m, -high, -low), 0).astype(np.uint8)
+
+
+def _mask_colours(mask: UInt8[Array, "h w"]) -> Image:
+    """Visible part white, hidden part red, other things blue, the silhouette's contour green."""
+    image = np.zeros((*mask.shape, 3), np.uint8)
+    image[mask & BIT_FOREGROUND > 0] = (60, 90, 160)
+    image[mask & BIT_OBJECT > 0] = (190, 60, 60)
+    image[mask & BIT_VISIBLE > 0] = (235, 235, 235)
+    image[contour_mask(mask & BIT_OBJECT > 0)] = _GREEN
+    return image
+
+
+def _titles() -> Image:
+    return _strip(_TITLES, len(_TITLES))
+
+
+def _strip(texts: Sequence[str], cells: int) -> Image:
+    strip = np.full((_CAPTION_PX, cells * CELL_PX, 3), 24, np.uint8)
+    for i, text in enumerate(texts):
+        size = 0.3 if len(texts) > 1 else 0.42
+        place = (i * CELL_PX + 4, _CAPTION_PX - 7)
+        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, (230, 230, 230), 1, cv2.LINE_AA)
+    return strip

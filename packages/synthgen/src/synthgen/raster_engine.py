@@ -1,0 +1,139 @@
+"""The `raster` engine: scenes drawn by posecore's rasteriser, for drafts, tests and machines without Blender."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from posecore.camera import crop_K
+from posecore.errors import RenderError
+from posecore.mesh import Mesh
+from posecore.raster import MAX_LIGHTS, DirectionalLight, Instance, Rasteriser, SceneLayers, Shading
+from posecore.window import Window
+
+from synthgen.engine import RenderedScene
+from synthgen.scene import Light, Material, Scene, Vector
+from synthgen.sensor import linear_from_display
+
+Array = np.ndarray
+
+_SUPERSAMPLING = 2
+_WHITE_KEY = -1_000_000_000  # a mesh's all-white twin, drawn where a material replaces its colours
+
+
+class RasterEngine:
+    """Engine over `posecore.raster`: no shadows, no reflections, lamps taken as if they were at infinity."""
+
+    name = "raster"
+
+    def __init__(self) -> None:
+        self._meshes: dict[int, Mesh] = {}
+        self._rasteriser: Rasteriser | None = None
+
+    def load(self, meshes: Mapping[int, Mesh]) -> None:
+        """Make meshes known under their keys."""
+        if self._rasteriser is None:
+            self._rasteriser = Rasteriser({})
+        for key, mesh in meshes.items():
+            self._meshes[key] = mesh
+            self._rasteriser.add(key, mesh)
+            white = np.full((len(mesh.vertices_m), 3), 255, np.uint8)
+            self._rasteriser.add(_WHITE_KEY + key, replace(mesh, vertex_rgb=white, uv=None, texture_rgb=None))
+
+    def render(self, scene: Scene) -> RenderedScene:
+        """Render `scene.region_px`: colour with 2 x 2 samples a pixel, depth and index at the pixel centres."""
+        if self._rasteriser is None:
+            raise RenderError("the raster engine has no meshes; call load first")
+        x0, y0, width, height = scene.region_px
+        instances = [
+            Instance(
+                obj_id=o.mesh_key if o.material.base_rgb is None else _WHITE_KEY + o.mesh_key,
+                T_cam_obj=o.T_cam_obj,
+                tint=o.material.base_rgb or (1.0, 1.0, 1.0),
+            )
+            for o in scene.objects
+        ]
+        K = crop_K(scene.camera.K, Window(x0_px=x0, y0_px=y0, side_px=1.0), 1)
+        fine_K = np.diag([_SUPERSAMPLING, _SUPERSAMPLING, 1.0]) @ K
+        size = (width * _SUPERSAMPLING, height * _SUPERSAMPLING)
+        shading = _shading(scene)
+        fine = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
+        exact = self._rasteriser.render_scene(instances, K, width, height, shading=shading)
+        rgb_linear, alpha = _resolve(linear_from_display(_recolour(fine, scene)), fine.instance >= 0)
+        return RenderedScene(
+            rgb_linear=rgb_linear, alpha=alpha, depth_m=exact.depth_m, index=exact.instance.astype(np.int16)
+        )
+
+    def close(self) -> None:
+        """Free the GL context."""
+        if self._rasteriser is not None:
+            self._rasteriser.close()
+            self._rasteriser = None
+
+
+def _shading(scene: Scene) -> Shading:
+    """Lamps as directional lights. The shader multiplies display values, so linear factors are converted to them."""
+    target = scene.objects[0].T_cam_obj[:3, 3]
+    lamps = sorted(((_irradiance(light, target), light) for light in scene.lights), key=lambda pair: -pair[0])
+    lights = tuple(
+        DirectionalLight(direction_cam=_direction(light, target), rgb=_display_factor(light.rgb, irradiance / math.pi))
+        for irradiance, light in lamps[:MAX_LIGHTS]
+    )
+    ambient = _display_factor(scene.ambient_rgb, 1.0)
+    if not lights:  # the shader takes an empty list for a headlight
+        return Shading(ambient=sum(ambient) / 3, diffuse=0.0)
+    return Shading(ambient=sum(ambient) / 3, diffuse=1.0, lights=lights)
+
+
+def _irradiance(light: Light, at_cam_m: Float[Array, "3"]) -> float:
+    """Irradiance in W/m^2 at a point that faces the lamp."""
+    if light.kind == "sun":
+        return light.strength
+    d2 = float(np.sum((np.array(light.position_cam_m) - at_cam_m) ** 2))
+    return light.strength / (d2 * math.pi * (4.0 if light.kind == "point" else 1.0))
+
+
+def _direction(light: Light, at_cam_m: Float[Array, "3"]) -> Vector:
+    d = np.array(light.direction_cam) if light.kind == "sun" else np.array(light.position_cam_m) - at_cam_m
+    x, y, z = d / max(float(np.linalg.norm(d)), 1e-12)
+    return (float(x), float(y), float(z))
+
+
+def _display_factor(rgb: Vector, scale: float) -> Vector:
+    r, g, b = (max(c * scale, 0.0) ** (1 / 2.2) for c in rgb)
+    return (r, g, b)
+
+
+def _recolour(layers: SceneLayers, scene: Scene) -> UInt8[Array, "h w 3"]:
+    """Apply each material's hue, saturation and value to the pixels of its object."""
+    rgb = layers.rgb
+    for i, placed in enumerate(scene.objects):
+        material = placed.material
+        if material.base_rgb is None and _changes_colour(material):
+            inside = layers.instance == i
+            if inside.any():
+                rgb[inside] = _shift(rgb[inside], material)
+    return rgb
+
+
+def _changes_colour(material: Material) -> bool:
+    return (material.hue_shift, material.saturation, material.value) != (0.0, 1.0, 1.0)
+
+
+def _shift(rgb: UInt8[Array, "n 3"], material: Material) -> UInt8[Array, "n 3"]:
+    hsv = cv2.cvtColor(rgb[None].astype(np.float32) / np.float32(255.0), cv2.COLOR_RGB2HSV)
+    hsv[..., 0] = (hsv[..., 0] + np.float32(360.0 * material.hue_shift)) % np.float32(360.0)
+    hsv[..., 1] = np.clip(hsv[..., 1] * np.float32(material.saturation), 0.0, 1.0)
+    hsv[..., 2] = np.clip(hsv[..., 2] * np.float32(material.value), 0.0, 1.0)
+    return np.asarray((cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] * 255.0 + 0.5).astype(np.uint8))
+
+
+def _resolve(rgb: Float[Array, "h2 w2 3"], hit: Array) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """Average the fine samples of a pixel: straight colour and coverage."""
+    s = _SUPERSAMPLING
+    height, width = hit.shape[0] // s, hit.shape[1] // s
+    count = hit.reshape(height, s, width, s).sum(axis=(1, 3)).astype(np.float32)
+    total = (rgb * hit[..., None]).reshape(height, s, width, s, 3).sum(axis=(1, 3))
+    return (total / np.maximum(count, 1.0)[..., None]).astype(np.float32), count / np.float32(s * s)

@@ -1,0 +1,41 @@
+"""Random streams: every draw of a dataset has an address, so sample i never depends on sample i - 1.
+
+A stream is addressed by (seed, purpose, subject, scene, attempt, ...). Different subjects (pose, lights, ...) have
+streams of their own: changing the lamps in a configuration leaves the poses of every sample as they were.
+"""
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Purpose(IntEnum):
+    """What the scenes are for; training pairs and test frames never share a scene."""
+
+    PAIRS = 0
+    FRAMES = 1
+
+
+class Subject(IntEnum):
+    """What is drawn."""
+
+    POSE = 0
+    LIGHTS = 1
+    MATERIAL = 2
+    OCCLUDERS = 3
+    BACKGROUND = 4
+    SENSOR = 5
+    HYPOTHESIS = 6
+    CONTOUR = 7
+    LIBRARY = 8
+    RENDER = 9
+
+
+def stream(seed: int, purpose: Purpose, subject: Subject, *address: int) -> np.random.Generator:
+    """The generator at an address of non-negative integers."""
+    return np.random.default_rng(np.random.SeedSequence([seed, int(purpose), int(subject), *address]))
+
+
+def child_seed(rng: np.random.Generator) -> int:
+    """A seed for something drawn later, in [0, 2**31)."""
+    return int(rng.integers(0, 2**31))

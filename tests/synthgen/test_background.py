@@ -1,0 +1,57 @@
+import numpy as np
+import pytest
+from posecore.errors import ConfigError
+from synthgen import background
+from synthgen.scene import Background
+
+
+def test_a_seed_gives_the_same_picture_and_another_seed_another():
+    a, b = (background.draw(Background(seed=5), 90, 60) for _ in range(2))
+    assert a.shape == (60, 90, 3)
+    assert a.dtype == np.uint8
+    assert np.array_equal(a, b)
+    assert not np.array_equal(a, background.draw(Background(seed=6), 90, 60))
+
+
+def test_drawn_backgrounds_differ_in_colour_and_texture():
+    pictures = np.stack([background.draw(Background(seed=s), 48, 48) for s in range(60)]).astype(float)
+    means = pictures.mean(axis=(1, 2))
+    texture = np.abs(np.diff(pictures, axis=2)).mean(axis=(1, 2, 3))
+    assert means.std(axis=0).min() > 20
+    assert texture.min() < 3
+    assert texture.max() > 15
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 200), (640, 480)])
+def test_any_size_can_be_drawn(size):
+    for seed in range(12):
+        assert background.draw(Background(seed=seed), *size).shape == (size[1], size[0], 3)
+
+
+def test_photographs_are_cropped_at_random_without_distortion(tmp_path):
+    import cv2
+
+    photo = np.zeros((100, 400, 3), np.uint8)
+    photo[..., 0] = np.arange(400)[None] % 256
+    photo[..., 2] = 200
+    cv2.imwrite(str(tmp_path / "a.png"), photo[..., ::-1])
+    (tmp_path / "notes.txt").write_text("no picture")
+    (path,) = background.list_photos(tmp_path)
+    crops = [background.draw(Background(kind="photo", path=path, seed=s), 64, 48) for s in range(4)]
+    assert all(c.shape == (48, 64, 3) for c in crops)
+    assert all((c[..., 2] == 200).all() for c in crops)  # red and blue are not swapped
+    assert not np.array_equal(crops[0], crops[1])
+
+
+def test_missing_and_empty_folders_are_named(tmp_path):
+    with pytest.raises(ConfigError, match="no such folder"):
+        background.list_photos(tmp_path / "none")
+    with pytest.raises(ConfigError, match="no picture"):
+        background.list_photos(tmp_path)
+
+
+def test_a_broken_photograph_is_named(tmp_path):
+    (tmp_path / "broken.jpg").write_bytes(b"not a picture")
+    (path,) = background.list_photos(tmp_path)
+    with pytest.raises(ConfigError, match=r"broken\.jpg"):
+        background.draw(Background(kind="photo", path=path), 8, 8)

@@ -1,0 +1,116 @@
+import os
+import re
+
+import pytest
+from click.testing import CliRunner
+from synthgen.cli import main
+
+
+def invoke(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def error_line(result):
+    assert "Traceback" not in result.output
+    lines = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(lines) == 1, result.output
+    return lines[0]
+
+
+@pytest.mark.parametrize("name", sorted(main.commands))
+def test_every_command_has_an_example_and_every_option_help(name):
+    command = main.commands[name]
+    assert f"synthgen {name}" in (command.help or "")
+    for parameter in command.params:
+        assert parameter.param_type_name == "argument" or parameter.help, f"{name} {parameter.name}"
+    page = invoke(name, "--help")
+    assert page.exit_code == 0
+    assert any(line.startswith(f"  synthgen {name} ") for line in page.output.splitlines()), "examples are re-wrapped"
+
+
+def test_options_of_the_examples_exist():
+    for name, command in main.commands.items():
+        known = {option for p in command.params for option in p.opts}
+        assert set(re.findall(r"--[a-z-]+", command.help or "")) <= known, name
+
+
+def test_wrong_usage_ends_with_2(tug_ply, tmp_path):
+    out = tmp_path / "out"
+    for arguments in (
+        ["render", "--object", tug_ply, "--n", "0", "--out", out],
+        ["render", "--object", tug_ply, "--out", out],
+        ["render", "--object", tug_ply, "--n", "4", "--out", out, "--engine", "povray"],
+        ["render", "--object", tug_ply, "--n", "4", "--out", out, "--preset", "fast"],
+        ["render", "--object", tug_ply, "--n", "4", "--out", out, "--set", "windw.padding=1"],
+        ["render", "--object", tug_ply, "--n", "4", "--out", out, "--backgrounds", tmp_path / "none"],
+        ["bop", "--object", tug_ply, "--frames", "0", "--out", out],
+        ["preview", out, "--out", tmp_path / "sheet.gif"],
+    ):
+        result = invoke(*arguments)
+        assert result.exit_code == 2, (arguments, result.output)
+        assert "Traceback" not in result.output
+    assert not out.exists()
+
+
+def test_a_missing_mesh_is_one_line(tmp_path):
+    result = invoke("render", "--object", tmp_path / "none.ply", "--n", 4, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "none.ply" in error_line(result)
+
+
+def test_wrong_units_are_suspected(tug_ply, tmp_path):
+    result = invoke("render", "--object", tug_ply, "--units", "m", "--n", 4, "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "did you mean --units" in error_line(result)
+
+
+def test_a_file_in_the_place_of_the_folder_is_one_line(tug_ply, tmp_path, small_set):
+    (tmp_path / "out").write_text("a file")
+    result = invoke("render", "--object", tug_ply, "--n", 4, "--out", tmp_path / "out", *small_set)
+    assert result.exit_code == 1
+    assert "out" in error_line(result)
+    result = invoke("bop", "--object", tug_ply, "--frames", 1, "--out", tmp_path / "out", *small_set)
+    assert result.exit_code == 1
+    assert "out" in error_line(result)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_rights_is_one_line(tug_ply, tmp_path, small_set):
+    (tmp_path / "locked").mkdir(mode=0o500)
+    result = invoke("render", "--object", tug_ply, "--n", 4, "--out", tmp_path / "locked" / "out", *small_set)
+    assert result.exit_code == 1
+    assert "permission" in error_line(result)
+
+
+def test_a_foreign_folder_is_left_alone(tug_ply, tmp_path, small_set):
+    (tmp_path / "notes.txt").write_text("mine")
+    result = invoke("render", "--object", tug_ply, "--n", 4, "--out", tmp_path, *small_set)
+    assert result.exit_code == 1
+    assert "not empty" in error_line(result)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_render_and_preview(tug_ply, tmp_path, small_set):
+    import cv2
+
+    shards, sheet = tmp_path / "shards", tmp_path / "sheet.png"
+    result = invoke("render", "--object", tug_ply, "--n", 5, "--out", shards, "--workers", 1, *small_set)
+    assert result.exit_code == 0, result.output
+    assert "complete, 5 pairs" in result.stderr
+    again = invoke("render", "--object", tug_ply, "--n", 5, "--out", shards, "--workers", 1, *small_set)
+    assert again.exit_code == 0
+    assert "5 of 5 pairs are there" in again.stderr
+    assert invoke("preview", shards, "--out", sheet, "--count", 3, "--first", 2).exit_code == 0
+    image = cv2.imread(str(sheet))
+    assert image.shape[1] > 1000
+    assert image.std() > 20
+    result = invoke("preview", shards, "--out", sheet, "--first", 5)
+    assert result.exit_code == 1
+    assert "no rendered sample from 5 on" in error_line(result)
+
+
+def test_bop_renders_frames(tug_ply, tmp_path, small_set):
+    result = invoke("bop", "--object", tug_ply, "--frames", 1, "--out", tmp_path / "bop", *small_set)
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "bop/test/000001/rgb/000000.png").is_file()
+    assert (tmp_path / "bop/test_targets_bop19.json").is_file()

@@ -1,0 +1,54 @@
+import pytest
+from posecore import config as config_tools
+from posecore.errors import ConfigError
+from synthgen.config import SynthConfig, load_config, preset_names
+
+
+def test_every_preset_resolves_and_survives_a_round_trip():
+    assert {"default", "quickstart"} <= set(preset_names())
+    for name in preset_names():
+        config = load_config(name)
+        assert config_tools.build(SynthConfig, config_tools.to_dict(config), "again") == config
+
+
+def test_priority_is_preset_then_set_then_option():
+    config = load_config("default", ["samples=3", "window.padding=0.5"], {"samples": 5, "seed": None})
+    assert (config.samples, config.window.padding, config.seed) == (5, 0.5, 0)
+    assert config.patch_px == load_config("default").patch_px
+
+
+def test_a_preset_file_is_read(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("patch_px: 96\ndistance: {unit: m, min: 0.4, max: 0.9}\n")
+    config = load_config(str(file))
+    assert (config.patch_px, config.distance.range_m(0.1)) == (96, (0.4, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        (["windw.padding=1"], "windw"),
+        (["window.paddin=1"], "window.paddin"),
+        (["distance.min=9", "distance.max=3"], "distance"),
+        (["shard_size=10", "hypotheses_per_scene=4"], "shard_size"),
+        (["engine=povray"], "engine"),
+        (["lights.count=[1]"], "lights.count"),
+        (["perturbation.max_angle_deg=-3"], "max_angle_deg"),
+    ],
+)
+def test_a_wrong_key_or_value_is_named(overrides, named):
+    with pytest.raises(ConfigError, match=named):
+        load_config("default", overrides)
+
+
+def test_an_unknown_preset_lists_the_known_ones():
+    with pytest.raises(ConfigError, match="default, quickstart"):
+        load_config("fast")
+
+
+def test_distances_follow_the_object_or_are_absolute():
+    near, far = load_config("default").distance.range_m(0.03)
+    assert near == pytest.approx(0.12)
+    assert far == pytest.approx(0.3)
+    with pytest.raises(ConfigError, match=r"distance\.min"):
+        load_config("default", ["distance.unit=m", "distance.min=0.05"]).distance.range_m(0.1)

@@ -1,0 +1,69 @@
+import json
+import platform
+from dataclasses import replace
+
+import pytest
+from posecore.errors import ConfigError, DatasetError
+from posecore.mesh import Mesh
+from synthgen import dataset
+from synthgen.target import object_ids
+
+
+def test_the_card_tells_everything_but_time_and_place(config_of, tug):
+    card = dataset.make_card(config_of(), 10, {1: tug}, ())
+    text = json.dumps(card)
+    assert platform.node() not in text
+    assert str(tug.path) not in text
+    assert card["objects"]["1"]["sha256"] == tug.sha256
+    assert card["config"]["occluders"]["library"] == 8
+    assert card["versions"]["posecore"]
+    assert "bpy" not in card["versions"]
+    assert "bpy" in dataset.make_card(config_of("engine=cycles"), 10, {1: tug}, ())["versions"]
+
+
+def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
+    (tmp_path / "a.jpg").write_bytes(b"1")
+    one = dataset.make_card(config_of(), 10, {1: tug}, [str(tmp_path / "a.jpg")])["backgrounds"]
+    (tmp_path / "a.jpg").write_bytes(b"2")
+    two = dataset.make_card(config_of(), 10, {1: tug}, [str(tmp_path / "a.jpg")])["backgrounds"]
+    assert one["photos"] == two["photos"] == 1
+    assert one["sha256"] != two["sha256"]
+
+
+def test_depths_that_shards_cannot_hold_are_refused_before_rendering(config_of, tug):
+    with pytest.raises(ConfigError, match=r"distance\.max"):
+        dataset.make_card(config_of("distance.unit=m", "distance.min=1", "distance.max=8"), 1, {1: tug}, ())
+
+
+@pytest.mark.parametrize("scale", [0.25, 3.0])  # 3 cm and 36 cm
+def test_any_size_of_object_fits_the_defaults(config_of, tug, scale):
+    mesh = Mesh(vertices_m=tug.vertices_m * scale, faces=tug.faces, normals=tug.normals, vertex_rgb=tug.vertex_rgb)
+    card = dataset.make_card(config_of(), 1, {1: mesh}, ())
+    plain = dataset.make_card(config_of(), 1, {1: tug}, ())
+    side = [c["objects"]["1"]["window_side_px"] for c in (card, plain)]
+    assert side[0] == pytest.approx(side[1])
+
+
+def test_symmetries_are_found_by_name_or_id(tug, tmp_path):
+    entry = {"diameter": 118.9, "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+    for key in ("tug", "1"):
+        file = tmp_path / "models_info.json"
+        file.write_text(json.dumps({key: entry}))
+        infos = dataset.load_symmetries(str(file), {1: tug})
+        assert len(infos[1].symmetries_discrete) == 1
+        files = dataset.model_files({1: tug}, infos)
+        assert sorted(files) == ["models/models_info.json", "models/obj_000001.ply"]
+        assert "symmetries_discrete" in json.loads(files["models/models_info.json"])["1"]
+    file.write_text(json.dumps({"cup": entry}))
+    with pytest.raises(DatasetError, match="cup"):
+        dataset.load_symmetries(str(file), {1: replace(tug, path="tug.ply")})
+    with pytest.raises(DatasetError, match="cannot be read"):
+        dataset.load_symmetries(str(tmp_path / "none.json"), {1: tug})
+
+
+def test_object_ids_follow_bop_names_or_the_order():
+    assert object_ids(["a.ply", "b.ply"]) == [1, 2]
+    assert object_ids(["x/obj_000009.ply", "obj_000002.ply"]) == [9, 2]
+    assert object_ids(["obj_000009.ply", "b.ply"]) == [1, 2]
+    with pytest.raises(ConfigError, match="object id 3"):
+        object_ids(["a/obj_000003.ply", "b/obj_000003.ply"])

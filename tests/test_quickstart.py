@@ -1,0 +1,120 @@
+"""The quick start runs from mesh to report, with tiny numbers; and goes on where it was stopped."""
+
+import importlib.util
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).resolve().parent.parent / "examples" / "quickstart.py"
+
+
+@cache
+def quickstart():
+    spec = importlib.util.spec_from_file_location("quickstart", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["quickstart"] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def smoke(work: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(SCRIPT), str(work), "--smoke"]
+    return subprocess.run(command, capture_output=True, text=True, timeout=280)
+
+
+@pytest.mark.slow
+def test_smoke_run_ends_in_a_report_and_is_not_repeated(tmp_path: Path) -> None:
+    work = tmp_path / "quick start"  # a space, because users have them
+    first = smoke(work)
+    assert first.returncode == 0, first.stdout + first.stderr
+    page = work / "report" / "index.html"
+    assert str(page) in first.stdout
+    summary = json.loads((work / "report" / "summary.json").read_text())
+    names = [entry["name"] for entry in summary["against_start"]]
+    assert "quick" in names
+    assert all(entry["missing"] == 0 for entry in summary["against_start"])
+    shown = [shlex.split(line.split("$ ", 1)[1]) for line in first.stdout.splitlines() if line.startswith("  $ ")]
+    assert [words[:2] for words in shown][:3] == [["synthgen", "render"], ["synthgen", "bop"], ["refinenet", "train"]]
+
+    written = page.stat().st_mtime_ns
+    second = smoke(work)
+    assert second.returncode == 0, second.stdout + second.stderr
+    assert "  $ " not in second.stdout
+    assert page.stat().st_mtime_ns == written
+
+
+def recorder(ran: list) -> Callable:
+    """Stands in for running a command: notes it, and leaves what it would leave."""
+
+    def record(step, work, interrupted):
+        ran.append((step.name, interrupted))
+        (work / step.leaves).parent.mkdir(parents=True, exist_ok=True)
+        (work / step.leaves).touch()
+
+    return record
+
+
+def test_a_step_that_changed_makes_the_later_ones_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, ran = quickstart(), []
+    monkeypatch.setattr(module, "run_step", recorder(ran))
+    module.run_all(tmp_path, module.SMOKE)
+    everything = [step.name for step in module.steps(tmp_path, module.SMOKE)]
+    assert ran == [(name, False) for name in everything]
+
+    ran.clear()
+    module.run_all(tmp_path, module.SMOKE)
+    assert ran == []
+
+    mark = tmp_path / ".steps" / "train.json"
+    mark.write_text(json.dumps(json.loads(mark.read_text()) | {"command": ["refinenet", "train", "otherwise"]}))
+    module.run_all(tmp_path, module.SMOKE)
+    assert ran == [(name, False) for name in everything[everything.index("train") :]]
+
+    ran.clear()
+    (tmp_path / "report" / "summary.json").unlink()
+    module.run_all(tmp_path, module.SMOKE)
+    assert ran == [("report", False)]
+
+
+def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module, ran = quickstart(), []
+
+    record = recorder(ran)
+
+    def stop_in_training(step, work, interrupted):
+        if step.name == "train" and not interrupted:
+            raise KeyboardInterrupt
+        record(step, work, interrupted)
+
+    monkeypatch.setattr(module, "run_step", stop_in_training)
+    with pytest.raises(KeyboardInterrupt):
+        module.run_all(tmp_path, module.SMOKE)
+    ran.clear()
+    module.run_all(tmp_path, module.SMOKE)
+    assert ran[0] == ("train", True)
+    assert ran[1][0] == "start-poses"
+
+
+def summary_with(vss_gain: float, xy: float, rotation: float, missing: int = 0) -> dict:
+    ratio = {"tx_mm": xy, "ty_mm": xy, "tz_mm": 1.0, "re_sym_deg": rotation}
+    entry = {
+        "name": "quick",
+        "missing": missing,
+        "vss_mean": {"start": 0.6, "refined": 0.6 + vss_gain},
+        "medians": {name: {"ratio": value} for name, value in ratio.items()},
+    }
+    return {"against_start": [entry | {"name": "shipped"}, entry]}
+
+
+def test_promises_are_kept_or_missed_by_the_reports_numbers() -> None:
+    kept = [promise.kept for promise in quickstart().promises(summary_with(0.1, 0.4, 0.7))]
+    assert all(kept)
+    for worse in (summary_with(0.05, 0.4, 0.7), summary_with(0.1, 0.6, 0.7), summary_with(0.1, 0.4, 0.9)):
+        assert not all(promise.kept for promise in quickstart().promises(worse))
+    assert not all(promise.kept for promise in quickstart().promises(summary_with(0.1, 0.4, 0.7, missing=1)))
