@@ -91,7 +91,7 @@ def test_depth_is_camera_z_at_the_pixel_centre(cycles):
 def test_geometry_agrees_with_the_rasteriser(cycles, meshes):
     rng = np.random.default_rng(3)
     with Rasteriser(meshes) as raster:
-        for number in range(20):
+        for number in range(50):
             key = (TUG, BOBBIN)[number % 2]
             K = intrinsics(*rng.uniform(300, 700, 2), *rng.uniform(30, 90, 2))
             T = se3.make_T(se3.random_rotation(rng), np.array([0.0, 0.0, rng.uniform(0.5, 1.0)]))
