@@ -15,10 +15,11 @@ N = 200
 
 
 @pytest.fixture(scope="module")
-def shard_arrays(tmp_path_factory: pytest.TempPathFactory, tug_ply: Path) -> dict[str, np.ndarray]:
+def shard_arrays(tmp_path_factory, tug_ply: Path) -> dict[str, np.ndarray]:
     out = tmp_path_factory.mktemp("pairs") / "shards"
-    command = f"render --object {tug_ply} --n {N} --out {out} --engine raster --preset quickstart --seed 5 --workers 1 --quiet"
-    result = CliRunner().invoke(main, command.split())
+    sampling = ["--engine", "raster", "--preset", "quickstart", "--seed", "5", "--workers", "1", "--quiet"]
+    command = ["render", "--object", str(tug_ply), "--n", str(N), "--out", str(out), *sampling]
+    result = CliRunner().invoke(main, command)
     assert result.exit_code == 0, result.output
     reader = ShardReader(str(out))
     parts = [reader.read(i) for i in reader.committed]
