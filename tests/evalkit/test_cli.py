@@ -226,3 +226,20 @@ def test_real_start_poses(shared_data, tmp_path):
     assert total["tx_mm_mean"] == pytest.approx(13.7, abs=1.0)
     assert total["ty_mm_mean"] == pytest.approx(13.3, abs=1.0)
     assert total["tz_mm_mean"] == pytest.approx(77.5, abs=3.0)
+
+
+def test_an_error_of_the_system_is_one_line(work, monkeypatch):
+    def unreadable(*_, **__):
+        raise PermissionError(13, "Permission denied", "test_bop/scene_gt.json")
+
+    monkeypatch.setattr("evalkit.cli.write_report", unreadable)
+    result = run("report")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("Error: test_bop/scene_gt.json: no permission")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_starts_are_not_written_over_a_folder(work):
+    result = run("perturb", "--dataset", "test_bop", "--out", "results", "--angles", "5")
+    assert result.exit_code == 2
+    assert "is a directory" in result.stderr

@@ -14,6 +14,7 @@ from evalkit.metrics import vss
 from evalkit.pairing import Pair, pair_up
 from evalkit.scores import by_level, by_object, scores
 from evalkit.silhouette import Patch, View
+from evalkit.summary import Scored, start_of
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, GroundTruth, Target, symmetry_transforms, write_results, write_targets
 from posecore.errors import DatasetError, ResultFileError
@@ -198,6 +199,17 @@ def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
         (10.0, 0.0, 1.0),
         (20.0, 1.0, 0.0),
     ]
+
+
+def test_a_file_is_compared_with_the_start_poses_it_came_from():
+    def scored(name, **sidecar):
+        file = ResultFile(name=name, path=Path(f"{name}.csv"), sha256="", sidecar=sidecar, estimates=[])
+        return Scored(file=file, pairs=[], rows=[], ignored=0)
+
+    starts = [scored("near", method="start"), scored("far", method="start")]
+    assert start_of(scored("a", init="far.csv"), starts) is starts[1]
+    assert start_of(scored("b", init="gone.csv"), starts) is starts[0]
+    assert start_of(scored("c"), starts) is starts[0]
 
 
 def test_a_ball_is_scored_without_sampling_error(dataset_path, tmp_path, perfect):

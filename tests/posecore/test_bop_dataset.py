@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from posecore import se3
 from posecore.bop import BopDataset, BopWriter, GroundTruth, ModelInfo, Target, write_models, write_targets
-from posecore.bop.images import image_size
+from posecore.bop.images import image_size, read_rgb, write_image
 from posecore.bop.writer import gt_info
 from posecore.camera import Camera
 from posecore.errors import DatasetError
@@ -196,6 +196,18 @@ def test_depth_as_tif_with_its_own_scale(dataset_path):
     depth_m = BopDataset(dataset_path).depth_m(3, 0)
     assert depth_m is not None
     assert np.allclose(depth_m, 0.5)
+
+
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+def test_an_image_that_is_cut_off_is_one_line(tmp_path, extension, capfd):
+    """OpenCV alone returns half a JPEG, and libpng writes to stderr."""
+    file = tmp_path / f"a.{extension}"
+    write_image(file, np.random.default_rng(0).integers(0, 255, (60, 80, 3), np.uint8))
+    assert read_rgb(file).shape == (60, 80, 3)
+    file.write_bytes(file.read_bytes()[:-2000])
+    with pytest.raises(DatasetError, match=rf"a.{extension}: cannot be decoded as an image"):
+        read_rgb(file)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("extension", ["png", "jpg", "tif"])

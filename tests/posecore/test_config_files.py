@@ -118,6 +118,13 @@ def test_full_disk_is_one_line_and_keeps_the_old_file(tmp_path: Path, monkeypatc
     assert len(list(tmp_path.iterdir())) == 1
 
 
+def test_a_folder_in_the_way_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "poses.csv").mkdir()
+    with pytest.raises(StorageError, match=r"poses.csv: a folder stands where a file is needed"):
+        files.write_atomic(tmp_path / "poses.csv", b"x")
+    assert [p.name for p in tmp_path.iterdir()] == ["poses.csv"]
+
+
 def test_exit_codes() -> None:
     assert exit_code(MeshError("x")) == 1
     with pytest.raises(ConfigError, match="no such data specification"):

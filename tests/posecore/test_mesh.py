@@ -1,7 +1,9 @@
 """Mesh files: formats, units, diameters and every kind of bad input."""
 
+import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -51,6 +53,40 @@ def test_diameter_is_the_largest_vertex_distance() -> None:
     assert diameter(flat) == pytest.approx(np.linalg.norm(flat[:, None] - flat, axis=-1).max())
 
 
+def test_diameter_of_many_points_is_still_exact() -> None:
+    """Points near the middle are left out; on a sphere none is, and more are left than are compared at once."""
+    rng = np.random.default_rng(1)
+    sphere = rng.normal(size=(1500, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    for points in (sphere, sphere * [1, 1, 3], 500 + sphere):
+        brute = max(float(np.linalg.norm(points - p, axis=1).max()) for p in points)
+        assert diameter(points) == pytest.approx(brute, rel=1e-12)
+
+
+def test_normals_have_length_1_whatever_the_file_holds(shared_data: Path) -> None:
+    cup = load_mesh(shared_data / "meshes/cup/cup.ply")  # its normals are 6.3 long
+    np.testing.assert_allclose(np.linalg.norm(cup.normals, axis=1), 1, atol=1e-6)
+
+
+def write_obj(folder: Path, texture: bytes | None) -> Path:
+    """Two triangles that share an edge, which is a texture seam: left half and right half of the image."""
+    (folder / "a.obj").write_text(
+        "mtllib a.mtl\nv 0 0 0\nv 50 0 0\nv 0 50 9\nv 50 50 9\n"
+        "vt 0 0\nvt 0.4 0\nvt 0.4 1\nvt 0.6 0\nvt 0.6 1\nvt 1 1\nusemtl m\nf 1/1 2/2 3/3\nf 2/4 4/6 3/5\n"
+    )
+    (folder / "a.mtl").write_text("newmtl m\nmap_Kd skin.png\n")
+    if texture is not None:
+        (folder / "skin.png").write_bytes(texture)
+    return folder / "a.obj"
+
+
+def test_a_texture_seam_does_not_smear(tmp_path: Path) -> None:
+    mesh = load_mesh(write_obj(tmp_path, cv2.imencode(".png", np.zeros((8, 8, 3), np.uint8))[1].tobytes()))
+    assert mesh.uv is not None
+    left, right = mesh.uv[mesh.faces][..., 0]
+    assert left.max() < 0.5 < right.min()
+
+
 def test_metres_read_as_mm_are_refused_with_the_hint(tmp_path: Path) -> None:
     file = write_box(tmp_path / "box.ply", (0.06, 0.04, 0.03))
     with pytest.raises(MeshError, match=r"box.ply: the diameter is 0.0781.* mm when read in mm.*--units m\?"):
@@ -82,6 +118,12 @@ def test_mm_read_as_metres_are_refused_with_the_hint(tmp_path: Path) -> None:
             b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\nnan 1 1\n0 50 0\n3 0 1 2\n",
             "vertex 1 is",
         ),
+        (
+            "torn.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+            b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n50 1 1\n0 50 0\n3 0 1 7\n",
+            r"face 0 names the vertices \[0, 1, 7\], expected 0 to 2",
+        ),
     ],
 )
 def test_bad_files_give_one_line_that_names_them(
@@ -96,12 +138,27 @@ def test_bad_files_give_one_line_that_names_them(
 
 
 def test_a_missing_texture_is_an_error_not_grey(tmp_path: Path) -> None:
-    (tmp_path / "a.obj").write_text(
-        "mtllib a.mtl\nv 0 0 0\nv 50 0 0\nv 0 50 9\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl m\nf 1/1 2/2 3/3\n"
-    )
-    (tmp_path / "a.mtl").write_text("newmtl m\nmap_Kd skin.png\n")
+    write_obj(tmp_path, None)
     with pytest.raises(MeshError, match=r"texture .*skin.png is missing"):
         load_mesh(tmp_path / "a.obj")
     (tmp_path / "a.mtl").unlink()
     with pytest.raises(MeshError, match=r"material file .*a.mtl is missing"):
         load_mesh(tmp_path / "a.obj")
+
+
+def test_a_texture_that_is_no_image_is_an_error_not_grey(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"texture .*skin.png is not an image"):
+        load_mesh(write_obj(tmp_path, b"no picture"))
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    whole = cv2.imencode(".png", noise)[1].tobytes()
+    with pytest.raises(MeshError, match=r"a.obj: its texture cannot be decoded"):
+        load_mesh(write_obj(tmp_path, whole[: len(whole) // 2]))
+
+
+def test_a_missing_gltf_texture_is_an_error_not_grey(shared_data: Path, tmp_path: Path) -> None:
+    bowl = shared_data / "meshes/evo_bowl"
+    (tmp_path / "evo_bowl.bin").write_bytes((bowl / "evo_bowl.bin").read_bytes())
+    content = json.loads((bowl / "evo_bowl.gltf").read_text()) | {"images": [{"uri": "a%20skin.png"}]}
+    (tmp_path / "bowl.gltf").write_text(json.dumps(content))
+    with pytest.raises(MeshError, match=r"texture .*a skin.png is missing"):
+        load_mesh(tmp_path / "bowl.gltf", units="m")

@@ -163,6 +163,23 @@ def test_open_and_inverted_meshes_are_drawn_from_both_sides(rasteriser: Rasteris
         np.testing.assert_array_equal(other.render(1, K, T, 140, 100).mask, rasteriser.render(1, K, T, 140, 100).mask)
 
 
+def test_a_mesh_far_off_its_origin_is_drawn_like_one_at_it(rasteriser: Rasteriser) -> None:
+    """Parts keep the coordinates of the whole machine: the origin may lie 20 m behind what is seen."""
+    away = np.array([0.0, 0.0, -20.0])
+    far = Mesh(vertices_m=RING.vertices_m + away, faces=RING.faces, normals=RING.normals, vertex_rgb=RING.vertex_rgb)
+    T = np.eye(4)[None].repeat(2, axis=0)
+    T[:, 2, 3] = [0.4, 0.25]
+    moved = T.copy()
+    moved[:, :3, 3] -= away
+    wanted = rasteriser.render(2, K, T, 140, 100)
+    with Rasteriser({2: far}) as other:
+        found = other.render(2, K, moved, 140, 100)
+    assert wanted.mask.any(axis=(1, 2)).all()
+    assert (wanted.mask != found.mask).sum() <= 40  # float32 holds 20 m to a micrometre: the rim may move
+    both = wanted.mask & found.mask
+    assert np.abs(wanted.depth_m - found.depth_m)[both].max() < 1e-4
+
+
 def test_object_behind_the_camera_is_not_drawn(rasteriser: Rasteriser) -> None:
     T = poses(1)
     T[0, 2, 3] = -0.4

@@ -88,9 +88,29 @@ def test_what_a_killed_writer_left_does_not_count(tmp_path: Path) -> None:
     (tmp_path / "d/scene_rgb/c/1/0/0").mkdir(parents=True)
     (tmp_path / "d/scene_rgb/c/1/0/0/0").write_bytes(encoded.files["scene_rgb"][:100])
     (tmp_path / "d/.manifest.jsonl.77.tmp").write_bytes(b"{")
+    (tmp_path / "d/scene_rgb/c/1/0/0/.0.77.tmp").write_bytes(b"half")
     assert shard.ShardReader(str(tmp_path / "d")).committed == [0]
     writer.commit(encoded)
+    assert not list((tmp_path / "d").rglob("*.tmp"))
     np.testing.assert_array_equal(shard.ShardReader(str(tmp_path / "d")).read(1)["K"], samples(4, 1)["K"])
+
+
+def test_a_writer_killed_while_it_created_the_dataset_is_followed_by_another(tmp_path: Path) -> None:
+    """The group's own file comes last: before it there are folders of fields, and nothing says what they are."""
+    write(str(tmp_path / "whole"))
+    (tmp_path / "d/scene_rgb").mkdir(parents=True)
+    (tmp_path / "d/scene_rgb/zarr.json").write_bytes((tmp_path / "whole/scene_rgb/zarr.json").read_bytes())
+    write(str(tmp_path / "d"))
+    assert contents(tmp_path / "d") == contents(tmp_path / "whole")
+
+
+def test_a_further_file_is_written_once(tmp_path: Path) -> None:
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
+    for _ in range(2):
+        writer.add_file("models/models_info.json", b"{}")
+    with pytest.raises(ShardError, match=r"models_info.json: is not the file that these settings make"):
+        writer.add_file("models/models_info.json", b"[]")
+    assert (tmp_path / "d/models/models_info.json").read_bytes() == b"{}"
 
 
 def test_another_dataset_is_refused_by_its_first_difference(tmp_path: Path) -> None:
@@ -120,6 +140,18 @@ def test_damage_is_named_by_file(tmp_path: Path, damage: str) -> None:
     with pytest.raises(ShardError, match=r"scene_rgb/c/1/0/0/0.*(expected|decode)"):
         shard.ShardReader(str(tmp_path / "d")).read(1)
     shard.ShardReader(str(tmp_path / "d")).read(0)
+
+
+def test_files_that_decode_but_are_not_the_shards_own_are_refused(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"))
+    manifest = (tmp_path / "d/manifest.jsonl").read_text().splitlines()
+    line = json.loads(manifest[1])
+    line["sha256"] = json.loads(manifest[0])["sha256"]
+    (tmp_path / "d/manifest.jsonl").write_text("\n".join([manifest[0], json.dumps(line), manifest[2]]) + "\n")
+    reader = shard.ShardReader(str(tmp_path / "d"))
+    with pytest.raises(ShardError, match="shard 1 differs from its checksum"):
+        reader.read(1)
+    reader.read(0)
 
 
 def test_another_schema_version_is_refused(tmp_path: Path) -> None:

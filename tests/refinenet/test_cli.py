@@ -1,7 +1,13 @@
+import errno
+import shutil
 import subprocess
 import sys
+import threading
 
 import pytest
+from posecore.shard import ShardReader
+from refinenet.data import split_by_scene
+from tensorboard.summary.writer.record_writer import RecordWriter
 
 SMALL = [
     "--steps", "2", "--batch", "4", "--workers", "0", "--threads", "1", "--set", "loss.contour_points=32",
@@ -34,20 +40,56 @@ def test_train_command(cli, dataset, tmp_path):
         (["--set", "optimiser.lr=fast"], 2, "optimiser.lr is 'fast', expected float"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
-        (["--resume"], 1, "no such checkpoint"),
+        (["--resume"], 1, "no run to resume"),
     ],
 )
 def test_train_errors_are_one_line(cli, dataset, tmp_path, arguments, code, text):
     result = cli("train", dataset, "--out", tmp_path / "run", *SMALL, *arguments)
     assert result.exit_code == code, result.output
     assert text in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
+    assert len(result.stderr.splitlines()) == 1
 
 
 def test_a_folder_that_is_no_dataset_is_one_line(cli, tmp_path):
     result = cli("train", tmp_path, "--out", tmp_path / "run", *SMALL)
     assert result.exit_code == 1
     assert "no shard dataset" in result.stderr
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_a_damaged_shard_is_one_line_also_from_a_loader_process(cli, dataset, tmp_path, workers):
+    copy = shutil.copytree(dataset, tmp_path / "shards")
+    validation = split_by_scene(ShardReader(str(copy)), 0.05, 0)[1]
+    damaged = next(shard for shard in range(6) if shard not in validation.rows)
+    file = copy / f"scene_rgb/c/{damaged}/0/0/0"
+    file.write_bytes(file.read_bytes()[:-100])
+    options = ["--workers", workers, "--set", "validation.scene_share=0.05", "--set", "loader.shuffle_shards=6"]
+    result = cli("train", copy, "--out", tmp_path / "run", *SMALL, *options, "--quiet")
+    assert result.exit_code == 1
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"Error: {file}: found ")
+
+
+def test_a_disk_that_is_full_for_tensorboard_is_one_line(cli, dataset, tmp_path, monkeypatch):
+    """Its events are written by a thread, whose traceback Python would print."""
+
+    def full(writer, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    printed = []
+    monkeypatch.setattr(threading, "excepthook", printed.append)
+    monkeypatch.setattr(RecordWriter, "write", full)
+    result = cli("train", dataset, "--out", tmp_path / "run", *SMALL, "--quiet")
+    assert result.exit_code == 1
+    (line,) = result.stderr.splitlines()
+    assert "tensorboard: the disk is full" in line
+    assert not printed
+
+
+def test_refined_poses_go_to_a_file_not_a_folder(cli, tmp_path):
+    result = cli("refine", "--checkpoint", "a", "--dataset", "b", "--init", "c", "--out", tmp_path)
+    assert result.exit_code == 2
+    assert "is a directory" in result.stderr
 
 
 @pytest.mark.slow

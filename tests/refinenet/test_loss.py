@@ -195,6 +195,15 @@ def test_point_loss_is_zero_at_the_truth_and_at_its_symmetric_twins(mesh, turned
     assert (loss.point_loss_px(update, turned, object_points(mesh)) > 1).all()
 
 
+def test_point_loss_follows_a_symmetry_whose_axis_misses_the_origin(mesh, turned):
+    half_turn = se3.make_T(se3.rotation_from_rotvec(np.array([0, 0, np.pi])), np.array([0.04, -0.02, 0]))
+    objects = object_points(mesh, np.stack([np.eye(4), half_turn]))
+    torch.testing.assert_close(loss.point_loss_px(true_update(turned), turned, objects), torch.zeros(12).double())
+    twin = turned.T_cam_obj @ torch.from_numpy(half_turn)
+    update = geometry.update_between(turned.T_cam_obj_hypothesis, twin)
+    assert (loss.point_loss_px(update, turned, objects) < 1e-9).all()
+
+
 def test_point_loss_is_disentangled(mesh, turned):
     """An error in depth alone leaves the gradient of the rotation at zero."""
     true = true_update(turned)

@@ -1,3 +1,4 @@
+import logging
 import subprocess
 import sys
 from dataclasses import replace
@@ -140,16 +141,18 @@ def test_without_weights_the_error_names_both_ways():
         backbone.load_pretrained(backbone.make_stem("inception_v3"), "inception_v3", None)
 
 
-def test_no_hub_is_a_one_line_error_that_names_both_ways(monkeypatch):
+def test_no_hub_is_a_one_line_error_that_names_both_ways(monkeypatch, caplog):
     import huggingface_hub
 
     def fail(*_, **__):
+        logging.getLogger("huggingface_hub.utils._http").warning("Retrying in 8s")
         raise OSError("no route\nto host")
 
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", fail)
     with pytest.raises(ConfigError, match=r"no route.*--backbone-weights FILE.*backbone.pretrained=false") as caught:
         backbone.load_pretrained(backbone.make_stem("inception_v4"), "inception_v4", None)
     assert "\n" not in str(caught.value)
+    assert not caplog.records
 
 
 def test_training_options_are_checked():

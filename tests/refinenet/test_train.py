@@ -3,10 +3,11 @@ import json
 import numpy as np
 import pytest
 import torch
-from posecore.errors import CheckpointError, ConfigError
+from posecore.errors import CheckpointError, ConfigError, StorageError
 from refinenet import checkpoint
 from refinenet.config import OptimiserConfig, load_config
 from refinenet.errors import TrainingError
+from refinenet.metrics import MetricLog
 from refinenet.network import PaperNet
 from refinenet.train import train
 from refinenet.trainer import Trainer, learning_rate
@@ -81,10 +82,24 @@ def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_pat
         train(small(), str(dataset), out)
     with pytest.raises(ConfigError, match=r"seed was 0 and is now 1; resume with the same settings"):
         train(small("seed=1"), str(dataset), out, resume=True)
-    with pytest.raises(CheckpointError, match="no such checkpoint"):
+    with pytest.raises(ConfigError, match=r"validation.scene_share was 0.2 and is now 0.4"):
+        train(small("validation.scene_share=0.4"), str(dataset), out, resume=True)
+    with pytest.raises(CheckpointError, match="no run to resume"):
         train(small(), str(dataset), tmp_path, resume=True)
     with pytest.raises(CheckpointError, match="a checkpoint of preset compact, expected preset paper"):
         checkpoint.load(out / "last.safetensors", "paper")
+
+
+def test_metrics_that_cannot_be_written_name_their_file(tmp_path):
+    with MetricLog(tmp_path, 0) as log:
+        log.write(1, {"loss_px": 1.0})
+        (tmp_path / "metrics.jsonl").unlink()
+        (tmp_path / "metrics.jsonl").symlink_to("/dev/full")
+        with pytest.raises(StorageError, match=r"metrics.jsonl: the disk is full"):
+            log.write(2, {"loss_px": 1.0})
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StorageError, match="a file stands where a folder is needed"):
+        MetricLog(tmp_path / "file", 0)
 
 
 def test_a_damaged_checkpoint_is_one_clean_error(run, tmp_path):

@@ -14,7 +14,8 @@ from posecore.camera import Camera, intrinsics, project
 from posecore.errors import MeshError, RenderError
 from posecore.mesh import Mesh, load_mesh
 from posecore.raster import Instance, Rasteriser
-from synthgen.engine import Engine, RenderedScene, make_engine
+from synthgen.engine import Engine, RenderedScene
+from synthgen.engines import make_engine
 from synthgen.scene import Light, Material, SceneObject
 
 pytestmark = pytest.mark.blender
@@ -49,7 +50,7 @@ def same(a: RenderedScene, b: RenderedScene) -> bool:
 
 
 def test_importing_the_contract_leaves_blender_alone():
-    code = "import sys, synthgen.engine, synthgen.scene; sys.exit('bpy' in sys.modules)"
+    code = "import sys, synthgen.engines, synthgen.scene; sys.exit('bpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

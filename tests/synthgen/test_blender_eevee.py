@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from blender_scenes import SKEWED, at, box, scene_of
-from synthgen.engine import make_engine
+from synthgen.engines import make_engine
 from synthgen.scene import Light, SceneObject
 
 pytestmark = [pytest.mark.blender, pytest.mark.slow]

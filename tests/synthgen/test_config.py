@@ -32,6 +32,7 @@ def test_a_preset_file_is_read(tmp_path):
         (["distance.min=9", "distance.max=3"], "distance"),
         (["shard_size=10", "hypotheses_per_scene=4"], "shard_size"),
         (["engine=povray"], "engine"),
+        (["patch_px=512"], "patch_px"),
         (["lights.count=[1]"], "lights.count"),
         (["perturbation.max_angle_deg=-3"], "max_angle_deg"),
     ],

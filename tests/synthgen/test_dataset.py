@@ -57,6 +57,9 @@ def test_symmetries_are_found_by_name_or_id(tug, tmp_path):
     file.write_text(json.dumps({"cup": entry}))
     with pytest.raises(DatasetError, match="cup"):
         dataset.load_symmetries(str(file), {1: replace(tug, path="tug.ply")})
+    file.write_text(json.dumps({"5": entry}))  # another dataset's numbers: no symmetry may get lost in silence
+    with pytest.raises(DatasetError, match="no entry for 1, tug; its keys are 5"):
+        dataset.load_symmetries(str(file), {1: tug})
     with pytest.raises(DatasetError, match="cannot be read"):
         dataset.load_symmetries(str(tmp_path / "none.json"), {1: tug})
 

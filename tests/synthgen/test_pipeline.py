@@ -7,10 +7,14 @@ import sys
 import time
 from pathlib import Path
 
+import dask
 import numpy as np
 import psutil
 import pytest
-from posecore.shard import ShardReader
+from distributed import Client
+from posecore.shard import Encoded, ShardReader, ShardWriter
+from synthgen import pipeline
+from synthgen.shardrun import ShardJob
 
 
 def command(tug_ply, out, small_set, *extra):
@@ -134,6 +138,33 @@ def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, sm
         assert named in result.stderr
         assert result.stderr.count("\n") == 1
     assert tree(reference) == before
+
+
+class Echo:
+    """Stands for a renderer: its shards say whose job they are."""
+
+    def __init__(self, job):
+        self.seed = job.card["seed"]
+
+    def render(self, shard_id):
+        line = {"shard": shard_id, "n": 2, "rejected": 0, "seed": self.seed, "bytes": {}}
+        return Encoded(shard_id=shard_id, files={}, line=line)
+
+
+def test_jobs_that_share_a_cluster_keep_their_own_recipes(tmp_path, monkeypatch, config_of):
+    monkeypatch.setattr(pipeline, "ShardRenderer", Echo)
+    settings = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with dask.config.set(pipeline._SETTINGS), Client(**settings) as client:
+        cards = [{"n": 6, "shard_size": 2, "patch_px": 16, "contour_points": 5, "seed": seed} for seed in (1, 2)]
+        plugins = [pipeline.RendererPlugin(ShardJob(config=config_of(), card=card, meshes={})) for card in cards]
+        for plugin in plugins:  # both are there before the first one's shards are asked for
+            client.register_plugin(plugin)
+        for card, plugin in zip(cards, plugins, strict=True):
+            writer = ShardWriter.create(str(tmp_path / str(card["seed"])), card)
+            pipeline._render_all(client, plugin.name, iter(range(3)), writer, lambda encoded: None)
+            manifest = (tmp_path / str(card["seed"]) / "manifest.jsonl").read_text()
+            assert writer.committed() == [0, 1, 2]
+            assert manifest.count(f'"seed": {card["seed"]}') == 3
 
 
 @pytest.mark.slow

@@ -5,7 +5,8 @@ import pytest
 from posecore.camera import Camera, intrinsics
 from posecore.errors import RenderError
 from posecore.se3 import make_T
-from synthgen.engine import Engine, make_engine
+from synthgen.engine import Engine
+from synthgen.engines import make_engine
 from synthgen.raster_engine import RasterEngine
 from synthgen.scene import Light, Material, Scene, SceneObject
 from synthgen.sensor import display_from_linear

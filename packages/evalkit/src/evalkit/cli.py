@@ -8,6 +8,7 @@ from typing import Any
 import click
 from posecore.bop import BopDataset
 from posecore.errors import PoseError, exit_code
+from posecore.files import storage_error
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -29,6 +30,9 @@ class CleanGroup(click.Group):
         except PoseError as error:
             click.echo(f"Error: {error}", err=True)
             ctx.exit(exit_code(error))
+        except OSError as error:
+            click.echo(f"Error: {storage_error(error.filename or 'storage', error)}", err=True)
+            ctx.exit(1)
 
 
 class Numbers(click.ParamType):
@@ -47,7 +51,8 @@ class Numbers(click.ParamType):
 
 
 FOLDER = click.Path(path_type=Path)
-split_option = click.option("--split", help="Split folder. Default: test, else val, else the only one.")
+NEW_FILE = click.Path(path_type=Path, dir_okay=False)
+split_option = click.option("--split", help="Split folder. Default: test, val, train_pbr, train or the only one.")
 
 
 @click.group(cls=CleanGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -126,7 +131,7 @@ def _total_line(file: dict[str, Any]) -> str:
 
 @main.command()
 @click.option("--dataset", type=FOLDER, required=True, help="BOP dataset folder with ground truth.")
-@click.option("--out", type=FOLDER, required=True, help="Result file to write; its sidecar goes beside it.")
+@click.option("--out", type=NEW_FILE, required=True, help="Result file to write; its sidecar goes beside it.")
 @split_option
 @click.option("--angles", type=Numbers(), default=(), help="Rotations, degrees: one start for each.")
 @click.option("--translations", type=Numbers(), default=(), help="Translations, object diameters: one start for each.")

@@ -40,7 +40,7 @@ def perturb_dataset(
     """Write start poses for every target, and in the sidecar the level of every line.
 
     A pose is rotated by exactly its angle about a random axis through the object's origin (in camera axes) and moved
-    by exactly its length in a random direction. Randomness depends on the seed and the target's ids only.
+    by exactly its length in a random direction. Randomness depends on the seed, the target's ids and the levels before.
 
     Args:
         dataset: with ground truth.

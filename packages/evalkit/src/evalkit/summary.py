@@ -72,7 +72,9 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
         "definitions": DEFINITIONS | {"VSS variant": VSS_DEFINITIONS[vss]},
         "versions": versions(),
         "files": [_file_summary(item) for item in scored],
-        "against_start": [against_start(starts[0], item) for item in scored if starts and item is not starts[0]],
+        "against_start": [
+            against_start(start_of(item, starts), item) for item in scored if starts and item is not starts[0]
+        ],
     }
     cleaned: dict[str, Any] = _without_nan(summary)
     return cleaned
@@ -91,6 +93,12 @@ def _file_summary(item: Scored) -> dict[str, Any]:
         "by_object": {str(obj_id): values for obj_id, values in by_object(item.rows).items()},
         "by_level": by_level(item.rows),
     }
+
+
+def start_of(item: Scored, starts: Sequence[Scored]) -> Scored:
+    """The start poses that a file came from: those that its sidecar names as `init`, else the first."""
+    named = [start for start in starts if start.file.path.name == item.file.sidecar.get("init")]
+    return [*named, *starts][0]
 
 
 def against_start(start: Scored, other: Scored) -> dict[str, Any]:

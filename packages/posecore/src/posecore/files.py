@@ -39,6 +39,8 @@ def storage_error(path: str | Path, error: OSError, size_bytes: int | None = Non
         return StorageError(f"{path}: no permission to write here; choose another folder or change its rights")
     if error.errno in (errno.ENOTDIR, errno.EEXIST):
         return StorageError(f"{path}: a file stands where a folder is needed; choose another path")
+    if error.errno == errno.EISDIR:
+        return StorageError(f"{path}: a folder stands where a file is needed; choose another path")
     return StorageError(f"{path}: {error.strerror or error}")
 
 

@@ -1,18 +1,21 @@
 """Triangle meshes with vertex colours or a texture, in metres."""
 
 import hashlib
+import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import unquote
 
+import cv2
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import pdist
+from scipy.spatial.distance import cdist
 
 from posecore.errors import MeshError
 from posecore.files import write_atomic
@@ -98,9 +101,15 @@ def diameter(points_m: Float[Array, "v 3"]) -> float:
         points = points[ConvexHull(points).vertices]
     except QhullError:  # flat or fewer than four points: every pair is looked at
         points = np.unique(points, axis=0)
-    if len(points) > 4000:  # a sphere-like hull; the blockwise maximum keeps memory bounded
-        return max(float(np.linalg.norm(points - p, axis=1).max()) for p in points)
-    return float(pdist(points).max()) if len(points) > 1 else 0.0
+    if len(points) < 2:
+        return 0.0
+    # The ends of the longest distance are both far from the middle: no nearer to it than that distance minus the
+    # largest radius. Most vertices of a smooth part are.
+    radius = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1)
+    found = cdist(points[[radius.argmax()]], points).max()
+    points = points[radius >= (1 - 1e-9) * found - radius.max()]
+    blocks = range(0, len(points), 512)  # of rows, so that memory stays bounded for a sphere, where all are left
+    return max(float(cdist(points[i : i + 512], points[i:]).max()) for i in blocks)
 
 
 def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
@@ -111,7 +120,8 @@ def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
         units: Unit of the file's coordinates. glTF is in metres by its specification: say `m`.
 
     Raises:
-        MeshError: Missing, unreadable, without faces, with NaN vertices, or of an absurd size in these units.
+        MeshError: Missing, unreadable, without faces, with NaN vertices, with a face that names a vertex that is not
+            there, or of an absurd size in these units.
     """
     file = Path(path)
     if not file.is_file():
@@ -120,29 +130,42 @@ def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
     if not data:
         raise MeshError(f"{file}: the file is empty (0 bytes), expected a mesh; export it again")
     geometry = _read(file)
-    vertices = np.asarray(geometry.vertices, np.float64) * METRES_PER_UNIT[units]
-    faces = np.asarray(geometry.faces, np.int32)
+    vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise MeshError(f"{file}: vertex {bad} is {vertices[bad].tolist()}, expected finite numbers; repair the mesh")
-    _check_diameter(file, diameter(vertices), units)
-    normals = np.asarray(geometry.vertex_normals, np.float32)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        bad = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))[0])
+        raise MeshError(
+            f"{file}: face {bad} names the vertices {faces[bad].tolist()}, expected 0 to {len(vertices) - 1}; "
+            "repair the mesh"
+        )
     vertex_rgb, uv, texture_rgb = _appearance(file, geometry)
-    return Mesh(
-        vertices_m=vertices,
+    mesh = Mesh(
+        vertices_m=vertices * METRES_PER_UNIT[units],
         faces=faces,
-        normals=normals,
+        normals=_unit(np.asarray(geometry.vertex_normals, np.float64)),
         vertex_rgb=vertex_rgb,
         uv=uv,
         texture_rgb=texture_rgb,
         path=str(file),
         sha256=hashlib.sha256(data).hexdigest(),
     )
+    _check_diameter(file, mesh.diameter_m, units)
+    return mesh
+
+
+def _unit(normals: Float[Array, "v 3"]) -> Float[Array, "v 3"]:
+    """Normals of length 1, as files need not hold them (MeshLab writes sums of angles); zero stays zero."""
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
 
 
 def _read(file: Path) -> trimesh.Trimesh:
     try:
-        loaded = trimesh.load(file, process=False, maintain_order=True)
+        # An OBJ's vertex on a texture seam becomes one vertex for each of its texture coordinates. With maintain_order
+        # it would keep one of them, and the texture would smear along the seam.
+        loaded = trimesh.load(file, process=False)
     except Exception as error:  # readers raise whatever they stumble over
         reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
         raise MeshError(
@@ -180,7 +203,11 @@ def _appearance(
     material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None:
-        return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
+        try:
+            texture_rgb = np.asarray(image.convert("RGB"), np.uint8)
+        except OSError as error:
+            raise MeshError(f"{file}: its texture cannot be decoded ({error}); export it again") from error
+        return None, np.asarray(visual.uv, np.float32), texture_rgb
     if material is not None:
         plain = np.asarray(material.main_color, np.uint8)[:3]
         return np.tile(plain, (len(geometry.vertices), 1)), None, None
@@ -190,20 +217,32 @@ def _appearance(
 
 
 def _refuse_missing_texture(file: Path) -> None:
-    """A material that names an image which is not there is an error, never a silent grey."""
+    """A material that names an image which is not there, or is none, is an error, never a silent grey."""
+    for texture in _textures(file):
+        if not texture.is_file():
+            raise MeshError(f"{file}: its texture {texture} is missing; put it beside the mesh")
+        if not cv2.haveImageReader(str(texture)):
+            raise MeshError(f"{file}: its texture {texture} is not an image; export it again")
+
+
+def _textures(file: Path) -> list[Path]:
+    """Image files that a mesh file names."""
+    if file.suffix.lower() == ".gltf":
+        images = json.loads(file.read_text(encoding="utf-8")).get("images", ())
+        links = [image["uri"] for image in images if not image.get("uri", "data:").startswith("data:")]
+        return [file.parent / unquote(link) for link in links]
     if file.suffix.lower() != ".obj":
-        return
+        return []
+    found = []
     for line in file.read_text(errors="replace").splitlines():
         if not line.startswith("mtllib "):
             continue
         material = file.parent / line.split(maxsplit=1)[1].strip()
         if not material.is_file():
             raise MeshError(f"{file}: its material file {material} is missing; put it beside the mesh")
-        for entry in material.read_text(errors="replace").splitlines():
-            if entry.strip().startswith("map_Kd "):
-                texture = file.parent / entry.split(maxsplit=1)[1].strip()
-                if not texture.is_file():
-                    raise MeshError(f"{file}: its texture {texture} is missing; put it beside the mesh")
+        entries = material.read_text(errors="replace").splitlines()
+        found += [file.parent / e.split(maxsplit=1)[1].strip() for e in entries if e.strip().startswith("map_Kd ")]
+    return found
 
 
 def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:

@@ -251,7 +251,7 @@ class Rasteriser:
                 row, column = divmod(i - start, used_columns)
                 target.viewport = (column * width_px, row * height_px, width_px, height_px)
                 instance = Instance(obj_id=obj_id, T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], width_px, height_px, near_m=_near_m([instance.T_cam_obj]))
+                self._draw(instance, 0, K[i], width_px, height_px, near_m=self._near_m([instance]))
             size = (used_columns * width_px, used_rows * height_px)
             atlas_depth = _tiles(self._read(target, size, 1)[..., :1], used_rows, used_columns)[: stop - start]
             depth[start:stop] = atlas_depth[..., 0]
@@ -273,7 +273,7 @@ class Rasteriser:
         self._set_shading(shading)
         target = self._begin(width_px, height_px)
         target.viewport = (0, 0, width_px, height_px)
-        near_m = _near_m([instance.T_cam_obj for instance in instances])  # one depth range for all that share a buffer
+        near_m = self._near_m(instances)  # one depth range for all that share a buffer
         for index, instance in enumerate(instances):
             self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m)
         size = (width_px, height_px)
@@ -312,10 +312,11 @@ class Rasteriser:
         mesh = self._mesh(instance.obj_id)
         array = self._array(instance.obj_id, mesh)
         T = np.asarray(instance.T_cam_obj, np.float64)
-        if float(T[2, :3] @ mesh.center_m + T[2, 3]) + mesh.diameter_m <= near_m:
+        center_z_m = self._center_z_m(instance)
+        if center_z_m + mesh.diameter_m <= near_m:
             return
         # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
-        if mesh.is_closed and float(T[2, 3]) - 2 * mesh.diameter_m > near_m:
+        if mesh.is_closed and center_z_m - mesh.diameter_m > near_m:
             self._context.enable(moderngl.CULL_FACE)
         else:
             self._context.disable(moderngl.CULL_FACE)
@@ -337,6 +338,16 @@ class Rasteriser:
             return np.frombuffer(data, np.uint8).reshape(height, width, 3)
         data = target.read(viewport=(0, 0, width, height), components=2, attachment=1, dtype="f4", alignment=1)
         return np.frombuffer(data, np.float32).reshape(height, width, 2)
+
+    def _center_z_m(self, instance: Instance) -> float:
+        """Camera z of the box centre, as the origin may lie metres off the mesh. No vertex is a diameter from it."""
+        T = instance.T_cam_obj
+        return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
+
+    def _near_m(self, instances: Sequence[Instance]) -> float:
+        """Near plane: close enough to cut nothing in practice, far enough for a 24-bit depth buffer to keep order."""
+        in_front = [z_m for instance in instances if (z_m := self._center_z_m(instance)) > 0]
+        return max(1e-3, 0.05 * min(in_front, default=0.0))
 
     def _mesh(self, obj_id: int) -> Mesh:
         if obj_id not in self._meshes:
@@ -373,12 +384,6 @@ class Rasteriser:
             if attachment is not None:
                 attachment.release()
         target.release()
-
-
-def _near_m(T_cam_obj: Sequence[Float[Array, "4 4"]]) -> float:
-    """Near plane: close enough to cut nothing in practice, far enough for a 24-bit depth buffer to keep order."""
-    in_front = [float(T[2, 3]) for T in T_cam_obj if T[2, 3] > 0]
-    return max(1e-3, 0.05 * min(in_front, default=0.0))
 
 
 def _clip_from_cam(

@@ -119,15 +119,17 @@ class ShardWriter:
         Raises:
             ShardError: The place holds something else; the message names the first key that differs.
         """
+        # The folders of the fields alone are what a run leaves that was killed before the group's own file was written.
+        own = {field.name for field in field_table()}
         name, version = schema()
         full = json.loads(json.dumps({"schema": name, "schema_version": version, **card}))
         store = open_store(str(url))
         existing = store.get(GROUP)
         if existing is not None:
             _same_card(str(url), _card(str(url), existing), full)
-        elif store.list_names():
+        elif foreign := [entry for entry in store.list_names() if entry not in own]:
             raise ShardError(
-                f"{url}: the folder is not empty ({store.list_names()[0]} is in it) and holds no dataset; "
+                f"{url}: the folder is not empty ({foreign[0]} is in it) and holds no dataset; "
                 "choose an empty or new folder"
             )
         writer = cls(str(url), full)
@@ -165,9 +167,19 @@ class ShardWriter:
         self._store.set(MANIFEST, text.encode())
 
     def add_file(self, key: str, data: bytes) -> None:
-        """Put a further file (a mesh, models_info.json) into the dataset, once."""
-        if self._store.get(key) != data:
+        """Put a further file (a mesh, models_info.json) into the dataset, once.
+
+        Raises:
+            ShardError: The dataset holds another file there.
+        """
+        found = self._store.get(key)
+        if found is None:
             self._store.set(key, data)
+        elif found != data:
+            raise ShardError(
+                f"{self.url}/{key}: is not the file that these settings make; start with the same settings (objects, "
+                "--models-info) to resume, or choose another --out"
+            )
 
 
 class ShardReader:
@@ -237,13 +249,15 @@ class ShardReader:
         """Decode a whole shard, or some of its fields, into physical units.
 
         Raises:
-            ShardError: Not committed, or a file is missing, of another length, or does not decode.
+            ShardError: Not committed, or a file is missing, of another length, or does not decode; when the whole shard
+                is read, also if its checksum differs.
         """
         if shard_id not in self._lines:
             raise ShardError(f"{self.url}: shard {shard_id} is not in {MANIFEST}; there are {len(self._lines)} shards")
         table = {f.name: f for f in field_table()}
         wanted = list(table) if fields is None else list(fields)
         scratch = MemoryStore()
+        digest = hashlib.sha256()
         expected = self._lines[shard_id]["bytes"]
         for name in wanted:
             key = _shard_key(name, shard_id, self.card)
@@ -256,6 +270,7 @@ class ShardReader:
                     f"{self.url}/{key}: found {found}, expected {expected.get(name)} bytes; the shard is damaged: "
                     f"delete its line (shard {shard_id}) from {MANIFEST} and run the same `synthgen render` again"
                 )
+            digest.update(data)
             _put(scratch, _shard_key(name, 0, self.card), data)
         _make_group(scratch, {**self.card, "n": self.shard_size}, wanted)
         group: Any = zarr.open_group(scratch, mode="r")
@@ -270,6 +285,11 @@ class ShardReader:
                     f"delete its line (shard {shard_id}) from {MANIFEST} and run the same `synthgen render` again"
                 ) from error
             values[name] = table[name].decode(stored)
+        if fields is None and digest.hexdigest() != self._lines[shard_id].get("sha256"):
+            raise ShardError(
+                f"{self.url}: shard {shard_id} differs from its checksum in {MANIFEST}; the shard is damaged: "
+                "delete its line and run the same `synthgen render` again"
+            )
         return values
 
 
@@ -360,7 +380,9 @@ def _card(url: str, group: bytes) -> dict[str, Any]:
     try:
         card = dict(json.loads(group)["attributes"])
     except (ValueError, KeyError, TypeError) as error:
-        raise ShardError(f"{url}/{GROUP}: not the metadata of a Zarr v3 group; the dataset is damaged") from error
+        raise ShardError(
+            f"{url}/{GROUP}: not the metadata of a Zarr v3 group; the dataset is damaged, delete it and render it again"
+        ) from error
     name, version = schema()
     found = (card.get("schema"), card.get("schema_version"))
     if found != (name, version):

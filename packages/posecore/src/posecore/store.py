@@ -37,8 +37,11 @@ class LocalStore:
             raise storage_error(self.root / key, error) from error
 
     def set(self, key: str, data: bytes) -> None:
-        """Write a file under a temporary name, then rename it."""
-        write_atomic(self.root / key, data)
+        """Write a file under a temporary name, then rename it; what a killed writer left of it goes."""
+        file = self.root / key
+        write_atomic(file, data)
+        for left in file.parent.glob(f".{file.name}.*.tmp"):
+            left.unlink(missing_ok=True)
 
     def list_names(self) -> list[str]:
         """Names in the folder; what a killed writer left under a temporary name does not count."""

@@ -215,7 +215,9 @@ def load_pretrained(stem: Stem, name: str, weights: str | None) -> None:
         raise ConfigError(f"backbone.name={name} has no weights on the hub that this project trusts: {ways}")
     try:
         from huggingface_hub import hf_hub_download
+        from huggingface_hub.utils import logging as hub_logging
 
+        hub_logging.set_verbosity_error()  # without a network it logs each of its retries; the error below says it once
         path = hf_hub_download(HUB_REPOSITORY, HUB_FILE)
     except Exception as error:  # the hub's client raises errors of several libraries
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,4 +1,4 @@
-"""Checkpoints: weights with the resolved config, step, seed and dataset hash in one safetensors file.
+"""Checkpoints: weights with the resolved config, step, seed, versions and dataset hash in one safetensors file.
 
 The optimiser's state lies beside it in a file named by its step, written first: a run killed between the two still
 finds the pair that belongs together.
@@ -6,7 +6,7 @@ finds the pair that belongs together.
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
+from refinenet import __version__
 from refinenet.config import TrainConfig
 from refinenet.network import make_network
 
@@ -87,6 +88,7 @@ def save(path: Path, network: nn.Module, provenance: Provenance) -> None:
         "dataset_sha256": provenance.dataset_sha256,
         "objects": json.dumps(provenance.objects),
         "camera_fx_px": repr(provenance.camera_fx_px),
+        "versions": json.dumps({"refinenet": __version__, "torch": torch.__version__}),
     }
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
     write_atomic(path, save_tensors(tensors, metadata))
@@ -110,7 +112,7 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: no such checkpoint; train one with `refinenet train`") from error
     except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path}: no readable safetensors file ({error})") from error
+        raise CheckpointError(f"{path}: no readable safetensors file ({error}); choose another checkpoint") from error
     found = (metadata.get("format"), metadata.get("version"))
     if found != (FORMAT, VERSION):
         raise CheckpointError(f"{path}: format {found[0]} version {found[1]}, expected {FORMAT} version {VERSION}")
@@ -148,9 +150,13 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
     try:
         return dict(torch.load(path, map_location="cpu", weights_only=True))
     except FileNotFoundError as error:
-        raise CheckpointError(f"{path}: missing beside last.safetensors, so the run cannot be resumed") from error
+        raise CheckpointError(
+            f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"
+        ) from error
     except Exception as error:  # torch.load raises whatever its unpickler meets
-        raise CheckpointError(f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed") from error
+        raise CheckpointError(
+            f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"
+        ) from error
 
 
 def drop_states(folder: Path, keep: int) -> None:
@@ -164,8 +170,11 @@ def _state_path(folder: Path, step: int) -> Path:
     return folder / f"optimiser-{step:07d}.pt"
 
 
-MAY_CHANGE = ("steps", "threads", "device", "log_every", "checkpoint_every", "validation")
-"""Settings that a resumed run may change: they decide how long and where it runs, not what a step does."""
+MAY_CHANGE = ("steps", "threads", "device", "log_every", "checkpoint_every", "validation.pairs", "validation.every")
+"""Settings that a resumed run may change: they decide how long and where it runs, not what a step does.
+
+The share of scenes held out is none of them: with another one, scenes that were trained on would be measured on.
+"""
 
 
 def require_same(stored: TrainConfig, wanted: TrainConfig, where: Path) -> None:
@@ -174,7 +183,15 @@ def require_same(stored: TrainConfig, wanted: TrainConfig, where: Path) -> None:
     Raises:
         ConfigError: A setting differs; the first is named with both values.
     """
-    before, now = posecore_config.to_dict(stored), posecore_config.to_dict(wanted)
+    before, now = (dict(_leaves(posecore_config.to_dict(config))) for config in (stored, wanted))
     for key in before:
         if key not in MAY_CHANGE and before[key] != now[key]:
             raise ConfigError(f"{where}: {key} was {before[key]} and is now {now[key]}; resume with the same settings")
+
+
+def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value

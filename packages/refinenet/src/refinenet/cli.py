@@ -1,6 +1,8 @@
 """The `refinenet` command: train a network on pair shards, refine BOP estimates with it."""
 
+import json
 import logging
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +18,7 @@ PRESETS = ("paper", "compact")
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
 _CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
 _FILE = click.Path(path_type=Path)
+_NEW_FILE = click.Path(path_type=Path, dir_okay=False)
 
 log = logging.getLogger(__name__)
 
@@ -105,12 +108,14 @@ def train(
 
     named = {
         "steps": steps, "batch": batch, "loss.name": loss, "seed": seed, "loader.workers": workers, "threads": threads,
-        "device": device, "network.backbone.weights": None if backbone_weights is None else str(backbone_weights),
+        "device": device,
+        # quoted: a path may hold what YAML reads as a comment
+        "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
     }  # fmt: skip
     assigned = [*overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
     config = load_config(preset, assigned, file)
     folder = out or Path("runs") / preset
-    with _stoppable(folder), _training_bar(config.steps, quiet) as report:
+    with _stoppable(folder), _quiet_threads(), _training_bar(config.steps, quiet) as report:
         errors = run(config, shards, folder, resume=resume, report=report)
     for line in _comparison(errors):
         click.echo(line)
@@ -122,7 +127,7 @@ def train(
 @click.option("--dataset", required=True, type=_FILE, metavar="DIR", help="BOP dataset with the images.")
 @click.option("--split", metavar="NAME", help="Split folder. [test, val, train_pbr, train or the only one]")
 @click.option("--init", required=True, type=_FILE, metavar="CSV", help="Start poses, a BOP result file.")
-@click.option("--out", required=True, type=_FILE, metavar="CSV", help="Refined poses, a BOP result file.")
+@click.option("--out", required=True, type=_NEW_FILE, metavar="CSV", help="Refined poses, a BOP result file.")
 @click.option("--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose.")
 @click.option("--object", "objects", type=int, multiple=True, help="Refine only this object's poses. Repeatable. [all]")
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
@@ -179,13 +184,13 @@ def refine(
         )
     method = name or f"refinenet {loaded.provenance.config.preset} step {loaded.provenance.step}"
     sidecar = make_sidecar(
-        dataset=bop, loaded=loaded, starts=starts, start_path=init, start_sidecar=read_sidecar(init) or {},
+        dataset=bop, loaded=loaded, start_path=init, start_sidecar=read_sidecar(init) or {},
         method=method, iterations=iterations, refined=result,
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
     click.echo(
-        f"{out}: {len(starts)} poses refined, {result.converged} converged, {result.failed} failed"
-        + (" (start pose kept, score 0)" if result.failed else "")
+        f"{out}: {len(starts)} poses refined, {result.converged} converged, {len(result.failed_lines)} failed"
+        + (" (left out of the file: the object could not be seen)" if result.failed_lines else "")
     )
 
 
@@ -233,7 +238,8 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
     try:
         yield report
     finally:
-        bar.stop()
+        if bar.live.is_started:  # stopping one that never started prints an empty line
+            bar.stop()
 
 
 @contextmanager
@@ -244,6 +250,17 @@ def _stoppable(where: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         click.echo(f"Stopped; what was finished is in {where}", err=True)
         raise SystemExit(130) from None
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """TensorBoard's writing thread hands its error to the training thread, which reports it, and prints a traceback."""
+    before = threading.excepthook
+    threading.excepthook = lambda ended: log.info("%s: %s", ended.thread and ended.thread.name, ended.exc_value)
+    try:
+        yield
+    finally:
+        threading.excepthook = before
 
 
 def _start_logging(verbose: bool) -> None:

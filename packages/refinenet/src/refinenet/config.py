@@ -95,7 +95,8 @@ class HypothesisConfig:
         fresh: draw and render them anew at every pass; otherwise the shards' own pairs are used.
         max_angle_deg: largest rotation; angles are uniform up to it.
         max_translation_diameter: largest move, in object diameters; lengths are uniform up to it.
-        easy_share: share of samples whose range is scaled down at random, for the later iterations of a refinement.
+        easy_share: share of samples whose angle is scaled down at random, and of those whose distance is,
+            independently: what the later iterations of a refinement see.
         in_plane: turn each scene about the optical axis by a random angle.
     """
 
@@ -155,6 +156,7 @@ class LossConfig:
         name: which.
         gamma: weight of the translation in `mse`, per metre.
         point_weight: weight of the point loss in `contour+point`.
+        rotation_weight: weight of the rotation within the point loss; image-plane position and depth have 1.
         contour_points: contour points used of each patch.
         model_points: model points of the point loss.
         symmetry_step_deg: step at which continuous symmetries are sampled for the point loss.
@@ -163,6 +165,7 @@ class LossConfig:
     name: Literal["contour", "contour-forward", "mse", "point", "contour+point"] = "contour"
     gamma: float = 10.0
     point_weight: float = 1.0
+    rotation_weight: float = 1.0
     contour_points: int = 100
     model_points: int = 64
     symmetry_step_deg: float = 10.0

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Int
-from posecore.errors import ConfigError, ShardError
+from posecore.errors import ConfigError, PoseError, ShardError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader
 from torch import Tensor
@@ -125,7 +125,7 @@ class PairSource:
             )
 
     def close(self) -> None:
-        """Free the rasteriser's context."""
+        """Free what the rasteriser holds."""
         if self._rasteriser is not None:
             self._rasteriser.close()
 
@@ -274,12 +274,23 @@ def _init_worker(_: int) -> None:
     prepare_worker()
 
 
+class _Loader(DataLoader[Batch]):
+    """A loader whose processes' errors arrive as they were raised, not wrapped with a traceback into the message."""
+
+    def __iter__(self) -> Any:
+        try:
+            yield from super().__iter__()
+        except PoseError as error:
+            *wrapped, last = str(error).strip().splitlines()
+            raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None
+
+
 def make_loader(stream: PairStream) -> DataLoader[Batch]:
     """A loader of the stream's batches; processes are spawned, since a GL context does not survive a fork."""
     loader = stream.config.loader
     if loader.workers == 0:
-        return DataLoader(stream, batch_size=None)
-    return DataLoader(
+        return _Loader(stream, batch_size=None)
+    return _Loader(
         stream,
         batch_size=None,
         num_workers=stream.workers,

@@ -76,6 +76,9 @@ def draw_hypothesis(
 ) -> Float[Array, "4 4"]:
     """A pose near the truth: angle and distance uniform up to the configured ends, axis and direction uniform.
 
+    Either may be scaled down alone: after one update a pose is well placed in the image and still turned, so that is
+    what the later iterations of a refinement see.
+
     Args:
         T_cam_obj: Truth.
         diameter_m: Of the object.
@@ -83,10 +86,9 @@ def draw_hypothesis(
         rng: Source of every draw.
         reach: Factor on both ends.
     """
-    if rng.random() < config.easy_share:
-        reach = reach * rng.random()
-    angle_rad = np.deg2rad(config.max_angle_deg) * reach * rng.random()
-    distance_m = config.max_translation_diameter * diameter_m * reach * rng.random()
+    turn, move = (rng.random() if rng.random() < config.easy_share else 1.0 for _ in range(2))
+    angle_rad = np.deg2rad(config.max_angle_deg) * reach * turn * rng.random()
+    distance_m = config.max_translation_diameter * diameter_m * reach * move * rng.random()
     return se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
 
 

@@ -101,22 +101,25 @@ def mse_loss(update: PoseUpdate, target: Target, gamma: float) -> Float[Tensor, 
     return torch.linalg.vector_norm(quat, dim=-1) + gamma * torch.linalg.vector_norm(update.dt - true.dt, dim=-1)
 
 
-def point_loss_px(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
+def point_loss_px(
+    update: PoseUpdate, target: Target, objects: ObjectPoints, rotation_weight: float = 1.0
+) -> Float[Tensor, " b"]:
     """Disentangled point loss: rotation, image-plane position and depth, each with the other two at their truth.
 
-    Each term is the mean L1 distance of model points, minimised over the object's symmetries, in metres times
-    f_crop / z: patch pixels, comparable with the contour loss.
+    Each term is the mean L1 distance of model points, in metres times f_crop / z: patch pixels, comparable with the
+    contour loss. The truth is the object's symmetric twin of it whose rotation is nearest; a symmetry whose axis misses
+    the object's origin moves that, too.
 
     Source: Labbe et al., CosyPose, ECCV 2020, and Simonelli et al., Disentangling Monocular 3D Object Detection.
     """
     predicted = geometry.apply_update(target.T_cam_obj_hypothesis, update)
     points = objects.points_m[target.object_index]
     T_true = target.T_cam_obj[:, None] @ objects.symmetries[target.object_index]
-    t_true = target.T_cam_obj[:, :3, 3]
-    wanted = torch.einsum("bsij,bmj->bsmi", T_true[..., :3, :3], points) + T_true[:, :, None, :3, 3]
-    got = points @ predicted[:, :3, :3].transpose(1, 2) + t_true[:, None]
+    wanted = torch.einsum("bsij,bmj->bsmi", T_true[..., :3, :3], points)
+    got = points @ predicted[:, :3, :3].transpose(1, 2)
     per_symmetry = (got[:, None] - wanted).abs().sum(-1).mean(-1)
-    rotation_m = per_symmetry.masked_fill(~objects.valid[target.object_index], torch.inf).amin(-1)
+    rotation_m, twin = per_symmetry.masked_fill(~objects.valid[target.object_index], torch.inf).min(-1)
+    t_true = T_true[torch.arange(len(twin), device=twin.device), twin, :3, 3]
 
     # Translations alone are compared at the true rotation: every model point moves alike, so one point stands for all.
     t = predicted[:, :3, 3]
@@ -125,14 +128,14 @@ def point_loss_px(update: PoseUpdate, target: Target, objects: ObjectPoints) -> 
     scale = t[:, 2] / t_true[:, 2]
     depth_m = ((scale[:, None] - 1) * t_true).abs().sum(-1)
     px_per_m = target.K_crop[:, 0, 0] / t_true[:, 2]
-    return (rotation_m + plane_m + depth_m) * px_per_m
+    return (rotation_weight * rotation_m + plane_m + depth_m) * px_per_m
 
 
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
 
 
 def make_loss(
-    name: str, *, gamma: float, point_weight: float, objects: ObjectPoints | None
+    name: str, *, gamma: float, point_weight: float, rotation_weight: float = 1.0, objects: ObjectPoints | None
 ) -> Callable[[PoseUpdate, Target], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
 
@@ -140,12 +143,13 @@ def make_loss(
         name: which.
         gamma: weight of the translation in `mse`, per metre.
         point_weight: weight of the point loss in `contour+point`.
+        rotation_weight: weight of the rotation within the point loss.
         objects: model points, for the losses with `point` in their name.
     """
 
     def points(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
         assert objects is not None
-        return point_loss_px(update, target, objects)
+        return point_loss_px(update, target, objects, rotation_weight)
 
     table: dict[str, Callable[[PoseUpdate, Target], Float[Tensor, " b"]]] = {
         "contour": contour_loss_px,

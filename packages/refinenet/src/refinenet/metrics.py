@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from posecore.errors import ConfigError
+from posecore.files import storage_error, write_atomic
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
@@ -82,17 +83,20 @@ class MetricLog:
     Args:
         folder: Of the run.
         start: Lines of later steps, left by a run that was killed after its last checkpoint, are dropped.
+
+    Raises:
+        StorageError: No rights, no space, or a file stands in the folder's place.
     """
 
     def __init__(self, folder: Path, start: int) -> None:
         self._path = folder / "metrics.jsonl"
+        kept = [line for line in self._lines() if line["step"] <= start]
+        write_atomic(self._path, "".join(json.dumps(line) + "\n" for line in kept).encode())
+        events = folder / "tensorboard"
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            kept = [line for line in self._lines() if line["step"] <= start]
-            self._path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+            self._writer = SummaryWriter(str(events), purge_step=start + 1)
         except OSError as error:
-            raise ConfigError(f"{folder}: cannot be written ({error.strerror}); choose another --out") from error
-        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=start + 1)
+            raise storage_error(events, error) from error
 
     def _lines(self) -> list[dict[str, Any]]:
         if not self._path.is_file():
@@ -106,11 +110,18 @@ class MetricLog:
         return lines
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        """One line of metrics of a step; units are in the keys."""
-        with self._path.open("a") as stream:
-            stream.write(json.dumps({"step": step, **values}) + "\n")
-        for key, value in values.items():
-            self._writer.add_scalar(key, value, step)
+        """One line of metrics of a step; units are in the keys.
+
+        Raises:
+            StorageError: No rights or no space any more.
+        """
+        try:
+            with self._path.open("a") as stream:
+                stream.write(json.dumps({"step": step, **values}) + "\n")
+            for key, value in values.items():
+                self._writer.add_scalar(key, value, step)
+        except OSError as error:
+            raise storage_error(self._path, error) from error
 
     def __enter__(self) -> "MetricLog":
         return self
@@ -118,4 +129,5 @@ class MetricLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._writer.close()
+        with suppress(OSError):  # events that a full disk refused; the error that ends the run says so
+            self._writer.close()

@@ -14,7 +14,7 @@ REFINED_RGB = (60, 230, 90)
 
 
 class Overlay:
-    """Draws contours onto images. A context manager around a renderer.
+    """Draws contours onto images, until it is closed.
 
     Args:
         meshes: Objects by id.
@@ -24,7 +24,7 @@ class Overlay:
         self._rasteriser = Rasteriser(meshes)
 
     def close(self) -> None:
-        """Free the renderer's context."""
+        """Free what the renderer holds."""
         self._rasteriser.close()
 
     def draw(

@@ -83,7 +83,7 @@ class Refiner:
         self.close()
 
     def close(self) -> None:
-        """Free the renderer's context."""
+        """Free what the renderer holds."""
         self._rasteriser.close()
 
     def refine(

@@ -6,7 +6,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from posecore import config as posecore_config
-from posecore.errors import ConfigError
+from posecore.errors import CheckpointError, ConfigError
 from posecore.files import write_atomic
 
 from refinenet.config import TrainConfig
@@ -21,8 +21,8 @@ def train(
 ) -> dict[str, float]:
     """Train a network; write `best.safetensors`, `last.safetensors`, `metrics.jsonl` and `config.yaml` to a folder.
 
-    The same config, data and seed give the same weights on the same machine, also when the run was interrupted and
-    resumed, as long as `threads` is the same.
+    The same config, data and seed give the same weights on the same processor, also when the run was interrupted and
+    resumed, as long as `threads` is the same. A GPU sums some gradients in no fixed order: there they are only close.
 
     Args:
         config: Everything but data and place.
@@ -42,6 +42,8 @@ def train(
     """
     if not resume and (out / "last.safetensors").exists():
         raise ConfigError(f"{out}: holds a run already; go on with --resume, or choose another --out")
+    if resume and not (out / "last.safetensors").exists():
+        raise CheckpointError(f"{out}: no run to resume, last.safetensors is missing; leave --resume out to start one")
     run = Trainer(config, url, out, resume=resume)
     main = run.rank == 0
     if main:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from posecore.errors import CheckpointError
+from posecore.errors import CheckpointError, ConfigError
 from torch import nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -30,7 +30,13 @@ def learning_rate(step: int, steps: int, config: OptimiserConfig) -> float:
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto` is a GPU where there is one; under torchrun each local rank takes its own."""
+    """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
+
+    Raises:
+        ConfigError: A GPU is asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
@@ -84,8 +90,9 @@ class Trainer:
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
         self.network = make_network(config.network).to(self.device)
         self._loss = make_loss(
-            config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight, objects=self.objects
-        )
+            config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
+            rotation_weight=config.loss.rotation_weight, objects=self.objects,
+        )  # fmt: skip
         self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
         self._optimiser = _optimiser(self.network, config.optimiser)
         self.step, self.best_mm = 0, math.inf
@@ -179,11 +186,11 @@ class Trainer:
 def _optimiser(network: nn.Module, config: OptimiserConfig) -> torch.optim.Optimizer:
     parameters = [p for p in network.parameters() if p.requires_grad]
     if config.name == "adam":
-        return torch.optim.Adam(parameters, lr=config.lr)
+        return torch.optim.Adam(parameters, lr=config.lr, fused=True)
     decayed = [p for p in parameters if p.ndim > 1]
     plain = [p for p in parameters if p.ndim <= 1]
     groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=config.lr)
+    return torch.optim.AdamW(groups, lr=config.lr, fused=True)
 
 
 def _not_finite(what: str, step: int, sample_ids: torch.Tensor) -> str:

@@ -12,6 +12,7 @@ from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh
 
 from synthgen.config import SynthConfig
+from synthgen.dataset import versions
 from synthgen.pair import PairMaker, limit_threads
 from synthgen.target import make_target
 
@@ -130,4 +131,4 @@ def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], frames
         raise storage_error(folder, error) from error
     except json.JSONDecodeError as error:
         raise DatasetError(f"{file}: is damaged; delete the folder and render it again") from error
-    write_atomic(file, (json.dumps(card, indent=2) + "\n").encode())
+    write_atomic(file, (json.dumps(card | {"versions": versions(config)}, indent=2) + "\n").encode())

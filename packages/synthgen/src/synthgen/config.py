@@ -20,6 +20,8 @@ from synthgen.engine import Device, EngineName
 Range = tuple[float, float]
 IntRange = tuple[int, int]
 
+MAX_PATCH_PX = 362  # shards hold distances up to 512 px, which is this patch's diagonal
+
 
 def _check_range(name: str, value: tuple[float, float], low: float = -math.inf, high: float = math.inf) -> None:
     a, b = value
@@ -337,7 +339,7 @@ class SynthConfig:
     def __post_init__(self) -> None:
         _check("seed", self.seed, 0, 2**63 - 1)
         _check("samples", self.samples, 1, 65536)
-        _check("patch_px", self.patch_px, 16, 4096)
+        _check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
         _check("contour_points", self.contour_points, 1, 100_000)
         _check("hypotheses_per_scene", self.hypotheses_per_scene, 1, 4096)
         _check("shard_size", self.shard_size, 1, 1_000_000)

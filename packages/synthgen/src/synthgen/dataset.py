@@ -9,6 +9,7 @@ from typing import Any
 
 from posecore import config as config_tools
 from posecore.bop import ModelInfo, load_models_info, write_models
+from posecore.bop.jsonfile import read_json
 from posecore.errors import ConfigError, DatasetError
 from posecore.files import sha256_bytes, sha256_file
 from posecore.mesh import Mesh
@@ -61,7 +62,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
         "camera": config_tools.to_dict(camera),
         "backgrounds": {"photos": len(photos), "sha256": _photos_hash(photos)} if photos else None,
         "units": _UNITS,
-        "versions": _versions(config),
+        "versions": versions(config),
     }
 
 
@@ -80,21 +81,15 @@ def load_symmetries(path: str | None, meshes: Mapping[int, Mesh]) -> dict[int, M
     """
     if path is None:
         return {}
-    by_stem = {Path(mesh.path).stem: obj_id for obj_id, mesh in meshes.items()}
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise DatasetError(f"{path}: cannot be read as JSON; give a BOP models_info.json") from error
+    ids = {str(obj_id): obj_id for obj_id in meshes} | {Path(mesh.path).stem: i for i, mesh in meshes.items()}
+    content = read_json(path)
+    entries = {str(ids[key]): entry for key, entry in content.items() if key in ids}
+    if not entries:
+        raise DatasetError(f"{path}: no entry for {', '.join(sorted(ids))}; its keys are {', '.join(content)}")
     with TemporaryDirectory() as folder:
         numbered = Path(folder) / "models_info.json"
-        entries = {
-            str(by_stem.get(key, key)): entry for key, entry in content.items() if key in by_stem or key.isdigit()
-        }
-        if not entries:
-            raise DatasetError(f"{path}: no entry for {', '.join(sorted(by_stem))}; its keys are {', '.join(content)}")
         numbered.write_text(json.dumps(entries), encoding="utf-8")
-        infos = load_models_info(numbered)
-    return {obj_id: info for obj_id, info in infos.items() if obj_id in meshes}
+        return load_models_info(numbered)
 
 
 def estimated_bytes(config: SynthConfig, n: int) -> int:
@@ -106,7 +101,8 @@ def _photos_hash(photos: Sequence[str]) -> str:
     return sha256_bytes("".join(sha256_file(p) for p in photos).encode())
 
 
-def _versions(config: SynthConfig) -> dict[str, str]:
+def versions(config: SynthConfig) -> dict[str, str]:
+    """Versions of what decides the bytes of a render."""
     names = list(_PACKAGES)
     if {config.engine, config.hypothesis_engine} & {"cycles", "eevee"}:
         names.append("bpy")

@@ -1,4 +1,4 @@
-"""The contract that every rendering engine keeps, and the one place that turns an engine's name into an engine."""
+"""The contract that every rendering engine keeps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,7 +6,6 @@ from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int16
-from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 
 from synthgen.scene import Scene
@@ -59,26 +58,3 @@ class Engine(Protocol):
 
     def close(self) -> None:
         """Free what the engine holds. Closing twice does nothing."""
-
-
-def make_engine(name: str, *, threads: int = 0, device: Device = "cpu") -> Engine:
-    """Make an engine by name; only then is what it needs imported.
-
-    Args:
-        name: 'cycles' (path tracing, the default elsewhere), 'eevee' (for GPUs) or 'raster' (drafts, no Blender).
-        threads: Threads a Blender engine may use, 0 for all cores.
-        device: Where Cycles traces; the other engines draw with OpenGL and take what it gives.
-
-    Raises:
-        ConfigError: The name is unknown.
-        RenderError: The engine cannot start here, e.g. because Blender's module is not installed.
-    """
-    if name == "raster":
-        from synthgen.raster_engine import RasterEngine
-
-        return RasterEngine()
-    if name == "cycles" or name == "eevee":
-        from synthgen.blender.engine import BlenderEngine
-
-        return BlenderEngine(name, threads=threads, device=device)
-    raise ConfigError(f"engine: got {name!r}, expected one of {', '.join(ENGINE_NAMES)}")

@@ -17,7 +17,8 @@ from posecore.window import Window, centred, cut, fixed_window
 from synthgen import sampling
 from synthgen.compose import compose, on_black
 from synthgen.config import SynthConfig
-from synthgen.engine import Engine, RenderedScene, make_engine
+from synthgen.engine import Engine, RenderedScene
+from synthgen.engines import make_engine
 from synthgen.region import bounds, holds, inside_image, region_of, scaled_camera, scaled_window, within
 from synthgen.sampling import SceneDraw
 from synthgen.scene import Light, Scene, SceneObject

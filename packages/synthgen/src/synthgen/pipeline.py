@@ -1,5 +1,6 @@
 """From a job to a complete dataset: shards on a cluster of processes, committed as they come back."""
 
+import json
 import logging
 import signal
 import threading
@@ -13,6 +14,7 @@ from distributed.scheduler import KilledWorker
 from distributed.worker import Worker
 from posecore import shard
 from posecore.errors import PoseError, RenderError
+from posecore.files import sha256_bytes
 
 from synthgen.shardrun import ShardJob, ShardRenderer
 
@@ -20,7 +22,6 @@ log = logging.getLogger(__name__)
 
 OnShard = Callable[[shard.Encoded], None]
 
-_PLUGIN = "synthgen-renderer"
 _AHEAD = 2  # shards a worker has waiting, so that it never waits for the driver
 _ALLOWED_FAILURES = 3  # times a shard may kill its worker before the run stops
 _SETTINGS = {
@@ -38,11 +39,14 @@ _SETTINGS = {
 
 
 class RendererPlugin(WorkerPlugin):
-    """Gives every worker the job, also one that joins late or replaces one that crashed."""
+    """Gives every worker the job, also one that joins late or replaces one that crashed.
 
-    name = _PLUGIN
+    Its name, and the tasks' keys with it, are the job's own: several jobs may share a cluster, where one name would
+    have one job's shards rendered with another's recipe.
+    """
 
     def __init__(self, job: ShardJob) -> None:
+        self.name = f"synthgen-{sha256_bytes(json.dumps(dict(job.card), sort_keys=True).encode())[:16]}"
         self.job = job
         self.renderer: ShardRenderer | None = None
 
@@ -69,16 +73,20 @@ def run(job: ShardJob, writer: shard.ShardWriter, *, workers: int, scheduler: st
     if not missing:
         return
     with _client(min(workers, len(missing)), scheduler) as client:
-        client.register_plugin(RendererPlugin(job))
-        _render_all(client, iter(missing), writer, on_shard)
+        plugin = RendererPlugin(job)
+        client.register_plugin(plugin)
+        _render_all(client, plugin.name, iter(missing), writer, on_shard)
 
 
-def _render_all(client: Client, missing: Iterator[int], writer: shard.ShardWriter, on_shard: OnShard) -> None:
+def _render_all(
+    client: Client, plugin: str, missing: Iterator[int], writer: shard.ShardWriter, on_shard: OnShard
+) -> None:
     def submit(shard_id: int) -> Any:
-        return client.submit(_render, shard_id, key=f"shard-{shard_id}", pure=False, priority=-shard_id)
+        key = f"shard {shard_id} of {plugin}"
+        return client.submit(_render, plugin, shard_id, key=key, pure=False, priority=-shard_id)
 
-    processes = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
-    waiting = as_completed([submit(i) for _, i in zip(range(_AHEAD * processes), missing, strict=False)])
+    slots = max(1, sum(client.nthreads().values()))
+    waiting = as_completed([submit(i) for _, i in zip(range(_AHEAD * slots), missing, strict=False)])
     for future in waiting:
         try:
             encoded = future.result()
@@ -101,10 +109,10 @@ def _render_all(client: Client, missing: Iterator[int], writer: shard.ShardWrite
             waiting.add(submit(following))
 
 
-def _render(shard_id: int) -> shard.Encoded:
-    plugin = get_worker().plugins[_PLUGIN]
-    assert isinstance(plugin, RendererPlugin) and plugin.renderer is not None
-    return plugin.renderer.render(shard_id)
+def _render(plugin: str, shard_id: int) -> shard.Encoded:
+    found = get_worker().plugins[plugin]
+    assert isinstance(found, RendererPlugin) and found.renderer is not None
+    return found.renderer.render(shard_id)
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore import se3
 from posecore.camera import project
 from posecore.contour import contour_mask
 from posecore.errors import ShardError
@@ -18,7 +19,7 @@ Image = UInt8[Array, "h w 3"]
 CELL_PX = 256
 _CAPTION_PX = 22
 _TITLES = (
-    "scene, contour of truth (green) and hypothesis (red)",
+    "scene, truth green, hypothesis red",
     "hypothesis and its contour",
     "distance to true contour",
     "distance to hypothesis contour",
@@ -50,7 +51,8 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         samples = reader.read(shard_id)
         rows += [_row({k: v[i - start] for k, v in samples.items()}, i) for i in wanted]
     if not rows:
-        raise ShardError(f"{url}: no rendered sample from {first} on; there are {len(reader.committed)} shards so far")
+        rendered = sum(map(reader.n_samples, reader.committed))
+        raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
     return np.concatenate([_titles(), *rows])
 
 
@@ -69,7 +71,7 @@ def _row(sample: Mapping[str, Array], index: int) -> Image:
         _enlarge(_depth_colours(sample["scene_depth_m"])),
     ]
     turn = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
-    angle = np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1)))
+    angle = np.rad2deg(se3.rotation_angle_rad(turn))
     moved = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
     caption = (
         f"sample {index}  scene {sample['scene_index']}  object {sample['obj_id']}  hypothesis off by {angle:.1f} deg, "

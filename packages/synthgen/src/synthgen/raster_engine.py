@@ -67,7 +67,7 @@ class RasterEngine:
         )
 
     def close(self) -> None:
-        """Free the GL context."""
+        """Free what was uploaded."""
         if self._rasteriser is not None:
             self._rasteriser.close()
             self._rasteriser = None

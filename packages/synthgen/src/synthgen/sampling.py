@@ -28,6 +28,7 @@ class SceneDraw:
         target: The object.
         T_cam_obj: Its true pose.
         others: Occluders and props.
+        material: Its surface.
         lights: Lamps.
         ambient_rgb: Even light.
         background: What lies behind.

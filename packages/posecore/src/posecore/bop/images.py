@@ -13,6 +13,7 @@ from posecore.files import write_atomic
 Array = np.ndarray
 COLOUR_FILES = tuple((folder, ext) for folder in ("rgb", "gray") for ext in ("png", "jpg", "jpeg", "tif", "tiff"))
 DEPTH_FILES = tuple(("depth", ext) for ext in ("png", "tif", "tiff"))
+_ENDINGS = ((b"\x89PNG", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))  # how a whole file starts and ends
 
 
 def find_image(scene: Path, im_id: int, choices: tuple[tuple[str, str], ...]) -> Path | None:
@@ -30,7 +31,13 @@ def read_image(path: Path, flags: int) -> Shaped[Array, "h w *c"]:
     Raises:
         DatasetError: the file is missing, cut off or not an image.
     """
-    image = cv2.imread(str(path), flags)
+    try:
+        data = path.read_bytes()
+    except OSError:
+        data = b""
+    # OpenCV fills the rest of a JPEG that is cut off with grey, and lets libpng complain on stderr about a PNG.
+    ending = next((end for start, end in _ENDINGS if data.startswith(start)), b"")
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and ending in data[-4096:] else None
     if image is None:
         raise DatasetError(f"{path}: cannot be decoded as an image; the file is missing or cut off, copy it again")
     return image
