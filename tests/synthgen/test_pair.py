@@ -4,9 +4,9 @@ from posecore.camera import crop_K, project
 from posecore.contour import contour_mask
 from posecore.errors import ConfigError
 from posecore.se3 import apply, inverse
-from posecore.shard import field_table
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, field_table
 from posecore.window import Window, silhouette_box
-from synthgen.pair import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, concatenate
+from synthgen.pair import concatenate
 from synthgen.streams import Purpose
 
 PLAIN = ("occluders.front=[0, 0]", "occluders.props=[0, 0]")

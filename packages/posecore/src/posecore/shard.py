@@ -25,6 +25,9 @@ from posecore.files import data_spec
 from posecore.store import Store, open_store
 
 Array = np.ndarray
+BIT_OBJECT, BIT_VISIBLE, BIT_FOREGROUND = 1, 2, 4
+"""Bits of `scene_mask`: the object's whole silhouette, its visible part, and anything in front of the background."""
+
 MANIFEST = "manifest.jsonl"
 GROUP = "zarr.json"
 

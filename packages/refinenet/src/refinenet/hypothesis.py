@@ -16,15 +16,13 @@ from posecore import contour, se3
 from posecore.camera import crop_K
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT
 from posecore.window import Window, diameter_window
 
 from refinenet import augment
 from refinenet.config import AugmentConfig, HypothesisConfig
 
 Array = np.ndarray
-OBJECT, FOREGROUND = 1, 4
-"""Bits of a shard's scene_mask used here: the whole object, hidden parts too; and any object in the scene."""
-
 MIN_CONTOUR_PX = 12
 """A contour of fewer pixels says nothing about a pose; the hypothesis is drawn again, nearer."""
 
@@ -224,7 +222,7 @@ class PairMaker:
             bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
             valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
             # Where the stored patch ends the silhouette is cut, which is no contour: outside counts as object.
-            outline = contour.contour_mask(((bits & OBJECT) > 0) | ~valid) & valid
+            outline = contour.contour_mask(((bits & BIT_OBJECT) > 0) | ~valid) & valid
             if outline.sum() >= MIN_CONTOUR_PX:
                 return _Draft(
                     index=index,
@@ -259,11 +257,11 @@ class PairMaker:
         if not exchange and draft.valid.all():
             return scene
         other = samples[int(rng.integers(len(samples)))]
-        behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & FOREGROUND) > 0, self._patch_px, rng)
+        behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, self._patch_px, rng)
         keep = draft.valid
         if exchange:
             bits = warp(draft.sample["scene_mask"], draft.patch_from_stored, self._patch_px, nearest=True)
-            keep = keep & ((bits & FOREGROUND) > 0)
+            keep = keep & ((bits & BIT_FOREGROUND) > 0)
         # The stored window's edge must not show: it was centred near the truth and would give the answer away.
         return np.where(keep[..., None], scene, behind)
 

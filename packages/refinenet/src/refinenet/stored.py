@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 from posecore.errors import ConfigError
+from posecore.shard import BIT_FOREGROUND
 
 from refinenet import augment
 from refinenet.config import AugmentConfig, TrainConfig
-from refinenet.hypothesis import FOREGROUND, PairArrays
+from refinenet.hypothesis import PairArrays
 
 STORED_FIELDS = (
     "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
@@ -46,8 +47,8 @@ def stored_pairs(
     for i, (sample, rng) in enumerate(zip(samples, rngs, strict=True)):
         if rng.random() < augment_config.background:
             other = samples[int(rng.integers(len(samples)))]
-            behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & FOREGROUND) > 0, stored_px, rng)
-            scenes[i] = np.where((sample["scene_mask"] & FOREGROUND)[..., None] > 0, scenes[i], behind)
+            behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng)
+            scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
     scene_rgb, hypothesis_rgb = augment.colour(scenes, stack("hypothesis_rgb"), augment_config, rngs[0])
     return PairArrays(
         scene_rgb=scene_rgb,

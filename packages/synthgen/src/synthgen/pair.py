@@ -12,6 +12,7 @@ from posecore.contour import contour_mask, distance_transform_px, sample_contour
 from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 from posecore.raster import Instance, Rasteriser
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import Window, centred, cut, fixed_window
 
 from synthgen import sampling
@@ -27,7 +28,6 @@ from synthgen.target import Target
 
 Array = np.ndarray
 
-BIT_OBJECT, BIT_VISIBLE, BIT_FOREGROUND = 1, 2, 4
 MAX_ATTEMPTS = 100
 MAX_HYPOTHESIS_ATTEMPTS = 50
 _GLANCE_PX = 64  # side of the small render that decides whether an occluder hides too much

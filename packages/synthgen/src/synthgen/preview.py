@@ -9,9 +9,7 @@ from posecore import se3
 from posecore.camera import project
 from posecore.contour import contour_mask
 from posecore.errors import ShardError
-from posecore.shard import ShardReader
-
-from synthgen.pair import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
 
 Array = np.ndarray
 Image = UInt8[Array, "h w 3"]
