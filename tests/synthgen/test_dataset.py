@@ -2,10 +2,12 @@ import json
 import platform
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import Mesh
 from synthgen import dataset
+from synthgen.config import load_config
 from synthgen.target import object_ids
 
 
@@ -28,11 +30,6 @@ def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
     two = dataset.make_card(config_of(), 10, {1: tug}, [str(tmp_path / "a.jpg")])["backgrounds"]
     assert one["photos"] == two["photos"] == 1
     assert one["sha256"] != two["sha256"]
-
-
-def test_depths_that_shards_cannot_hold_are_refused_before_rendering(config_of, tug):
-    with pytest.raises(ConfigError, match=r"distance\.max"):
-        dataset.make_card(config_of("distance.unit=m", "distance.min=1", "distance.max=8"), 1, {1: tug}, ())
 
 
 @pytest.mark.parametrize("scale", [0.25, 3.0])  # 3 cm and 36 cm
@@ -70,3 +67,17 @@ def test_object_ids_follow_bop_names_or_the_order():
     assert object_ids(["obj_000009.ply", "b.ply"]) == [1, 2]
     with pytest.raises(ConfigError, match="object id 3"):
         object_ids(["a/obj_000003.ply", "b/obj_000003.ply"])
+
+
+@pytest.mark.parametrize(("diameter_m", "step_m"), [(0.03, 1e-4), (0.12, 1e-4), (2.0, 8e-4)])
+def test_depth_of_large_objects_fits_in_coarser_steps(diameter_m, step_m):
+    """By default an object stands up to 10 diameters away, with props up to 4 diameters behind it."""
+    half = diameter_m / 2
+    mesh = Mesh(
+        vertices_m=np.array([[-half, 0, 0], [half, 0, 0], [0, half / 2, 0], [0, 0, half / 2]]),
+        faces=np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
+    )
+    card = dataset.make_card(load_config("default"), 8, {1: mesh}, ())
+    assert card["depth_step_m"] == pytest.approx(step_m)
+    assert card["depth_step_m"] * 65535 > 14 * diameter_m

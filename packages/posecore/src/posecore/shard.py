@@ -43,7 +43,7 @@ class Field:
         unit: Of the decoded value.
         codec: Inner codec, `zstd` or `shuffle+zstd`.
         text: One sentence.
-        scale: Decoded value = stored x scale; None when stored as it is.
+        scale: Decoded value = stored x scale; a name for that entry of the data card; None when stored as it is.
     """
 
     name: str
@@ -52,31 +52,43 @@ class Field:
     unit: str
     codec: str
     text: str
-    scale: float | None = None
+    scale: float | str | None = None
 
     def size(self, patch_px: int, contour_points: int) -> tuple[int, ...]:
         """Shape of one sample's value."""
         symbols = {"P": patch_px, "C": contour_points}
         return tuple(symbols[s] if isinstance(s, str) else s for s in self.shape)
 
-    def encode(self, values: Array) -> Array:
+    def step(self, card: Mapping[str, Any]) -> float | None:
+        """What one step of the stored integer is worth in `unit`; None when values are stored as they are.
+
+        Raises:
+            ShardError: The card lacks the entry that `scale` names.
+        """
+        if not isinstance(self.scale, str):
+            return self.scale
+        if self.scale not in card:
+            raise ShardError(f"the data card has no {self.scale}, which {self.name} is stored in; render again")
+        return float(card[self.scale])
+
+    def encode(self, values: Array, card: Mapping[str, Any]) -> Array:
         """Values in `unit` to what is stored; rounds to the nearest step and refuses what does not fit."""
-        if self.scale is None:
+        step = self.step(card)
+        if step is None:
             return np.asarray(values, self.dtype)
-        stored = np.rint(np.asarray(values, np.float64) / self.scale)
+        stored = np.rint(np.asarray(values, np.float64) / step)
         limit = np.iinfo(self.dtype).max
         if not (stored >= 0).all() or not (stored <= limit).all():  # NaN fails both
             raise ShardError(
                 f"{self.name}: values from {np.min(values)} to {np.max(values)} {self.unit}, "
-                f"expected 0 to {limit * self.scale:g} {self.unit} (what {self.dtype} steps of {self.scale:g} hold)"
+                f"expected 0 to {limit * step:g} {self.unit} (what {self.dtype} steps of {step:g} hold)"
             )
         return np.asarray(stored.astype(self.dtype))
 
-    def decode(self, stored: Array) -> Array:
+    def decode(self, stored: Array, card: Mapping[str, Any]) -> Array:
         """What is stored to values in `unit` (float32 where scaled)."""
-        return (
-            np.asarray(stored) if self.scale is None else np.asarray(stored.astype(np.float32) * np.float32(self.scale))
-        )
+        step = self.step(card)
+        return np.asarray(stored) if step is None else np.asarray(stored.astype(np.float32) * np.float32(step))
 
 
 @cache
@@ -116,8 +128,8 @@ class ShardWriter:
 
         Args:
             url: Folder or fsspec URL.
-            card: The data card. Must hold n, shard_size, patch_px and contour_points; schema is added. Nothing in it
-                may depend on time or machine, or resumed datasets would differ.
+            card: The data card. Must hold n, shard_size, patch_px, contour_points and depth_step_m; schema is
+                added. Nothing in it may depend on time or machine, or resumed datasets would differ.
 
         Raises:
             ShardError: The place holds something else; the message names the first key that differs.
@@ -287,7 +299,7 @@ class ShardReader:
                     f"{self.url}/{key}: does not decode ({type(error).__name__}); the shard is damaged: "
                     f"delete its line (shard {shard_id}) from {MANIFEST} and run the same `synthgen render` again"
                 ) from error
-            values[name] = table[name].decode(stored)
+            values[name] = table[name].decode(stored, self.card)
         if fields is None and digest.hexdigest() != self._lines[shard_id].get("sha256"):
             raise ShardError(
                 f"{self.url}: shard {shard_id} differs from its checksum in {MANIFEST}; the shard is damaged: "
@@ -307,7 +319,7 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
         if field.name not in arrays or arrays[field.name].shape != shape:
             found = arrays[field.name].shape if field.name in arrays else "nothing"
             raise ShardError(f"shard {shard_id}, {field.name}: found {found}, expected shape {shape}")
-        group[field.name][:count] = field.encode(arrays[field.name])
+        group[field.name][:count] = field.encode(arrays[field.name], card)
     contents = _contents(scratch)
     keys = {f.name: _shard_key(f.name, 0, card) for f in field_table()}
     files = {name: contents[key] for name, key in keys.items() if key in contents}
@@ -356,7 +368,7 @@ def _make_group(store: MemoryStore, card: Mapping[str, Any], names: Sequence[str
                 "sample",
                 *[str(s) if isinstance(s, str) else f"axis{i}" for i, s in enumerate(field.shape)],
             ],
-            attributes={"unit": field.unit, "scale": field.scale, "text": field.text},
+            attributes={"unit": field.unit, "scale": field.step(card), "text": field.text},
         )
 
 

@@ -15,13 +15,13 @@ from posecore.files import sha256_bytes, sha256_file
 from posecore.mesh import Mesh
 
 from synthgen.config import SynthConfig
-from synthgen.target import make_target
+from synthgen.target import Target, make_target
 
 # What decides the bytes of a sample beside the project itself.
 _PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "zarr", "moderngl", "trimesh")
 _UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
-# Depth is stored in steps of 0.1 mm in 16 bits.
-MAX_DEPTH_M = 6.5535
+DEPTH_STEPS = 65535  # depth is stored in 16 bits
+FINEST_DEPTH_STEP_M = 1e-4
 _DEPTH_BEHIND_DIAMETER = 4.0  # how far behind the object its props reach
 
 
@@ -29,24 +29,18 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
     """The data card: nothing in it depends on time, machine or number of workers.
 
     Raises:
-        ConfigError: n is not positive, or the distances do not suit an object.
+        ConfigError: n is not positive, or the distances do not suit an object's window.
     """
     if n < 1:
         raise ConfigError(f"--n {n}: expected at least 1 sample")
     targets = [make_target(obj_id, mesh, config) for obj_id, mesh in sorted(meshes.items())]
-    for target in targets:
-        reach = target.distance_m[1] + _DEPTH_BEHIND_DIAMETER * target.mesh.diameter_m
-        if reach > MAX_DEPTH_M:
-            raise ConfigError(
-                f"{target.name}: its scenes reach {reach:.2f} m deep and shards hold at most {MAX_DEPTH_M} m; "
-                "lower distance.min and distance.max (in diameters, or in metres with --set distance.unit=m)"
-            )
     camera = config.camera
     return {
         "n": n,
         "shard_size": config.shard_size,
         "patch_px": config.patch_px,
         "contour_points": config.contour_points,
+        "depth_step_m": depth_step_m(targets),
         "seed": config.seed,
         "config": config_tools.to_dict(config),
         "objects": {
@@ -64,6 +58,15 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
         "units": _UNITS,
         "versions": versions(config),
     }
+
+
+def depth_step_m(targets: Sequence[Target]) -> float:
+    """Step that depth is stored in: 0.1 mm, doubled until the deepest scene of the largest object fits."""
+    deepest_m = max(t.distance_m[1] + _DEPTH_BEHIND_DIAMETER * t.mesh.diameter_m for t in targets)
+    step_m = FINEST_DEPTH_STEP_M
+    while deepest_m > DEPTH_STEPS * step_m:
+        step_m *= 2
+    return step_m
 
 
 def model_files(meshes: Mapping[int, Mesh], infos: Mapping[int, ModelInfo]) -> dict[str, bytes]:
