@@ -110,14 +110,15 @@ def data_format_page() -> str:
     lines += [
         "",
         "A stored integer times its scale is the value in the unit; `posecore.shard.ShardReader` does that. "
-        "`depth_step_m` stands in the data card: 0.1 mm, doubled as often as the deepest scene of a very large object needs.",
+        "`depth_step_m` stands in the data card: 0.1 mm, doubled as often as the deepest scene of a very large object "
+        "needs.",
         "",
         "## The data card",
         "",
         "The group's attributes say how the dataset was made: schema and version, number of samples, shard size, patch "
-        "side, contour points, step of depth, seed, the resolved configuration, the camera, each object with the hash of its "
-        "file and its diameter, the versions of the software, and the units. The meshes lie beside it in `models/`, in BOP's "
-        "layout (millimetres), so a dataset needs nothing else.",
+        "side, contour points, step of depth, seed, the resolved configuration, the camera, each object with the hash "
+        "of its file and its diameter, the versions of the software, and the units. The meshes lie beside it in "
+        "`models/`, in BOP's layout (millimetres), so a dataset needs nothing else.",
         "",
         "## Complete or absent",
         "",
