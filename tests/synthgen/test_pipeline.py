@@ -113,14 +113,18 @@ def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set)
     assert tree(out) == tree(reference)
 
 
-def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set):
+@pytest.mark.parametrize("moment", ["rendering", "starting workers"])
+def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set, moment):
     arguments = command(tug_ply, tmp_path / "shards", small_set, "--n", "4000", "--workers", "1")
     process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    awaited = tmp_path / "shards" / ("manifest.jsonl" if moment == "rendering" else "zarr.json")
     started = time.monotonic()
-    while not (tmp_path / "shards" / "manifest.jsonl").exists() and time.monotonic() - started < 60:
-        time.sleep(0.05)
+    while not awaited.exists() and time.monotonic() - started < 120:
+        time.sleep(0.01)
+    if moment == "starting workers":
+        time.sleep(0.7)
     os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "same command again continues" in errors
     assert "Traceback" not in errors
