@@ -44,7 +44,7 @@ class Size:
     minutes: str
 
 
-FULL = Size(pairs=6000, frames=150, engine="cycles", train="--steps 6000 --threads 1", minutes="about 17 minutes")
+FULL = Size(pairs=6000, frames=150, engine="cycles", train="--steps 6000 --threads 1", minutes="about 16 minutes")
 SMOKE = Size(
     pairs=128,
     frames=3,
