@@ -161,7 +161,8 @@ def _words(
     said.append(f"mean VSS {vss_mean['start']:.3f} to {vss_mean['refined']:.3f}")
     are = "pose is" if missing == 1 else "poses are"
     lost = f" {missing} {are} missing in {name}: failures in the tables." if missing else ""
-    return f"{name} against its start poses ({start}), medians over the {count} poses found in both: {'; '.join(said)}.{lost}"
+    compared = f"{name} against its start poses ({start}), medians over the {count} poses found in both"
+    return f"{compared}: {'; '.join(said)}.{lost}"
 
 
 def _change(ratio: float) -> str:
