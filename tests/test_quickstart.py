@@ -118,3 +118,14 @@ def test_promises_are_kept_or_missed_by_the_reports_numbers() -> None:
     for worse in (summary_with(0.05, 0.4, 0.7), summary_with(0.1, 0.6, 0.7), summary_with(0.1, 0.4, 0.9)):
         assert not all(promise.kept for promise in quickstart().promises(worse))
     assert not all(promise.kept for promise in quickstart().promises(summary_with(0.1, 0.4, 0.7, missing=1)))
+
+
+def test_the_shipped_checkpoint_loads_and_is_of_the_example_object(repository, tug_ply):
+    from posecore.mesh import load_mesh
+    from refinenet import checkpoint
+
+    loaded = checkpoint.load(repository / "examples" / "checkpoints" / "tug_compact.safetensors", "compact")
+    loaded.network()
+    (trained,) = loaded.provenance.objects.values()
+    assert trained["sha256"] == load_mesh(tug_ply).sha256
+    assert loaded.provenance.step == 16000
