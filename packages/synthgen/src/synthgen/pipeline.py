@@ -129,7 +129,7 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
             with client:
                 yield client
             return
-        with _interrupts_deferred():
+        with _interrupts_ignored():
             cluster = LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
@@ -143,22 +143,19 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 
 @contextmanager
-def _interrupts_deferred() -> Iterator[None]:
+def _interrupts_ignored() -> Iterator[None]:
     """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
 
-    A process inherits what its parent ignores, while multiprocessing clears an inherited signal mask. Here the signal
-    is blocked as well: Linux then keeps it, ignored or not, and the driver gets it at the end instead of never.
+    A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
     """
     if threading.current_thread() is not threading.main_thread():  # only the main thread may set signal handlers
         yield
         return
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def threads_per_worker(workers: int, cores: int) -> int:
