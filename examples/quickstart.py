@@ -94,7 +94,7 @@ def steps(work: Path, size: Size) -> Iterator[Step]:
     yield Step(
         name="test-images",
         why="Test images with ground truth: other scenes.",
-        command=words(f"synthgen bop {scenes} --frames {size.frames} --seed 2 --out {folder}/test_bop"),
+        command=words(f"synthgen bop {scenes} --frames {size.frames} --seed 102 --out {folder}/test_bop"),
         leaves="test_bop/models/models_info.json",
     )
     yield Step(
@@ -107,7 +107,7 @@ def steps(work: Path, size: Size) -> Iterator[Step]:
         name="start-poses",
         why="Start poses: ground truth, turned by up to 20 degrees and moved by up to 0.2 diameters.",
         command=words(
-            f"evalkit perturb --dataset {folder}/test_bop --random-up-to 20 --random-translation 0.2 --seed 3"
+            f"evalkit perturb --dataset {folder}/test_bop --random-up-to 20 --random-translation 0.2 --seed 103"
             f" --out {folder}/results/start.csv"
         ),
         leaves="results/start.csv",

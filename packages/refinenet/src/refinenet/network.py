@@ -116,9 +116,9 @@ class LocalCorrelation(nn.Module):
 class CompactNet(nn.Module):
     """`plus` made small: match scene and hypothesis locally, then heads for 6D rotation, image-plane xy and log z.
 
-    Where each part of the object went is what rotation is read from. Convolutions over the stacked pair have to learn
-    to compare first, and moved x and y long before they turned anything (docs/method.md has the figures). LayerNorm
-    and GELU before the heads: a ReLU there died in training. See `geometry.crop_update` for the output.
+    Where each part of the object went is what rotation is read from, and convolutions over the stacked pair would have
+    to learn to compare first. LayerNorm and GELU before the heads: a ReLU there died in training. See
+    `geometry.crop_update` for the output.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
