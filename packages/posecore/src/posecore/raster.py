@@ -129,9 +129,9 @@ class Layers:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneLayers:
-    """One render of several objects; `instance` indexes them, -1 where nothing was hit."""
+    """One render of several objects; `instance` indexes them, -1 where nothing was hit; `rgb` may not be asked for."""
 
-    rgb: UInt8[Array, "h w 3"]
+    rgb: UInt8[Array, "h w 3"] | None
     depth_m: Float[Array, "h w"]
     instance: Int[Array, "h w"]
 
@@ -266,6 +266,7 @@ class Rasteriser:
         width_px: int,
         height_px: int,
         *,
+        rgb: bool = True,
         shading: Shading = HEADLIGHT,
     ) -> SceneLayers:
         """Draw several objects into one image."""
@@ -277,10 +278,8 @@ class Rasteriser:
         for index, instance in enumerate(instances):
             self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m)
         size = (width_px, height_px)
-        colours, layer = self._read(target, size, 0), self._read(target, size, 1)
-        return SceneLayers(
-            rgb=colours.copy(), depth_m=layer[..., 0].copy(), instance=layer[..., 1].round().astype(np.int16) - 1
-        )
+        colours, layer = self._read(target, size, 0).copy() if rgb else None, self._read(target, size, 1)
+        return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
 
     def _set_shading(self, shading: Shading) -> None:
         program, lights = self._program, shading.lights

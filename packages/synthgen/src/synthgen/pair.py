@@ -110,17 +110,18 @@ class PairMaker:
             engine.close()
         self._rasteriser.close()
 
-    def samples(self, scene_index: int, keep: int | None = None) -> dict[str, Array]:
+    def samples(self, scene_index: int, keep: int | None = None, first_attempt: int = 0) -> dict[str, Array]:
         """All samples of a scene, every field of the shard table with the hypotheses in front.
 
         Args:
             scene_index: Which scene.
             keep: Only this many hypotheses; the scene and the ones kept are the same as without it.
+            first_attempt: Draws of the scene before this one are left out, e.g. because one crashes the renderer.
 
         Raises:
             ConfigError: No acceptable scene or hypothesis is found with this configuration.
         """
-        draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index)
+        draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, first_attempt)
         while (hypotheses := self._hypotheses(draw, scene_index)) is None:
             draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, rejected_scenes + 1)
         shot = self._shoot(draw, [h.window for h in hypotheses])
@@ -197,7 +198,8 @@ class PairMaker:
             return area_px, 1.0
         instances = [Instance(obj_id=draw.target.obj_id, T_cam_obj=draw.T_cam_obj)]
         instances += [Instance(obj_id=o.mesh_key, T_cam_obj=o.T_cam_obj) for o in draw.others]
-        visible = (self._rasteriser.render_scene(instances, K, _GLANCE_PX, _GLANCE_PX).instance == 0).sum()
+        glance = self._rasteriser.render_scene(instances, K, _GLANCE_PX, _GLANCE_PX, rgb=False)
+        visible = (glance.instance == 0).sum()
         return area_px, float(visible / alone)
 
     def _hypotheses(self, draw: SceneDraw, scene_index: int) -> list[Hypothesis] | None:

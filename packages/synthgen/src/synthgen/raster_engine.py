@@ -60,7 +60,7 @@ class RasterEngine:
         size = (width * _SUPERSAMPLING, height * _SUPERSAMPLING)
         shading = _shading(scene)
         fine = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
-        exact = self._rasteriser.render_scene(instances, K, width, height, shading=shading)
+        exact = self._rasteriser.render_scene(instances, K, width, height, rgb=False)
         rgb_linear, alpha = _resolve(linear_from_display(_recolour(fine, scene)), fine.instance >= 0)
         return RenderedScene(
             rgb_linear=rgb_linear, alpha=alpha, depth_m=exact.depth_m, index=exact.instance.astype(np.int16)
@@ -109,6 +109,7 @@ def _display_factor(rgb: Vector, scale: float) -> Vector:
 def _recolour(layers: SceneLayers, scene: Scene) -> UInt8[Array, "h w 3"]:
     """Apply each material's hue, saturation and value to the pixels of its object."""
     rgb = layers.rgb
+    assert rgb is not None
     for i, placed in enumerate(scene.objects):
         material = placed.material
         if material.base_rgb is None and _changes_colour(material):
@@ -131,9 +132,8 @@ def _shift(rgb: UInt8[Array, "n 3"], material: Material) -> UInt8[Array, "n 3"]:
 
 
 def _resolve(rgb: Float[Array, "h2 w2 3"], hit: Array) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """Average the fine samples of a pixel: straight colour and coverage."""
-    s = _SUPERSAMPLING
-    height, width = hit.shape[0] // s, hit.shape[1] // s
-    count = hit.reshape(height, s, width, s).sum(axis=(1, 3)).astype(np.float32)
-    total = (rgb * hit[..., None]).reshape(height, s, width, s, 3).sum(axis=(1, 3))
-    return (total / np.maximum(count, 1.0)[..., None]).astype(np.float32), count / np.float32(s * s)
+    """Average the fine samples of a pixel: straight colour and coverage. Samples that hit nothing are black."""
+    size = (hit.shape[1] // _SUPERSAMPLING, hit.shape[0] // _SUPERSAMPLING)
+    alpha = cv2.resize(hit.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    premultiplied = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    return premultiplied / np.maximum(alpha, np.float32(0.25))[..., None], alpha

@@ -11,7 +11,7 @@ Array = np.ndarray
 
 def linear_from_display(rgb: UInt8[Array, "h w 3"]) -> Float[Array, "h w 3"]:
     """Linear light of display (sRGB) bytes."""
-    return _LINEAR[rgb]
+    return np.asarray(cv2.LUT(rgb, _LINEAR))
 
 
 def display_from_linear(rgb_linear: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:

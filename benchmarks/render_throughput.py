@@ -1,0 +1,226 @@
+"""Pairs a second of `synthgen render`, where the time of a pair goes, whether it stays flat, and a peer beside it.
+
+    python benchmarks/render_throughput.py --engine raster
+    python benchmarks/render_throughput.py --engine cycles --flat-scenes 2500
+    python benchmarks/render_throughput.py --engine cycles --blenderproc DIR --blenderproc-python PYTHON --rounds 3
+
+Throughput is measured on the real command with all its workers, from the first shard on disk to the last. Stages are
+measured in this process, one worker's work on one core. With `--blenderproc` (a source checkout of BlenderProc and a
+Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh at the same side, distances and samples
+per pixel in turn with ours: one scene and one hypothesis image a pair, depth and segmentation with both, with its
+default denoiser and with none, on all cores. It renders no occluders, background, contours or distance transforms and
+writes no file. The last line is JSON.
+"""
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from posecore import shard
+from posecore.camera import Camera
+from posecore.mesh import Mesh, load_mesh
+from synthgen import dataset
+from synthgen.config import SynthConfig, load_config
+from synthgen.pair import PairMaker, concatenate, limit_threads
+from synthgen.target import make_target
+
+Fields = dict[str, Any]
+
+
+class Stopwatch:
+    """Adds up the time spent in wrapped methods."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    def wrap(self, owner: Any, method: str, stage: str) -> None:
+        """Replace a bound method by one that is timed."""
+        inner: Callable[..., Any] = getattr(owner, method)
+        self.seconds[stage] = 0.0
+
+        def timed(*arguments: Any, **keywords: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return inner(*arguments, **keywords)
+            finally:
+                self.seconds[stage] += time.perf_counter() - began
+
+        setattr(owner, method, timed)
+
+
+def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
+    """Milliseconds a pair by stage, one process, one thread."""
+    limit_threads(1)
+    maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
+    card = dataset.make_card(config, config.shard_size, {1: mesh}, ())
+    for scene in range(3):  # loads, compiles
+        maker.samples(10_000_000 + scene)
+    watch = Stopwatch()
+    watch.wrap(maker, "accepted_scene", "draw")
+    watch.wrap(maker, "_hypotheses", "hypotheses")
+    watch.wrap(maker._engines[config.engine], "render", "render")
+    watch.wrap(maker, "_shoot", "render, background, sensor")
+    watch.wrap(maker, "_sample", "labels")
+    began = time.perf_counter()
+    done = [maker.samples(scene) for scene in range(scenes)]
+    total = time.perf_counter() - began
+    pairs = scenes * config.hypotheses_per_scene
+    shards = [concatenate(done[i : i + scenes_per_shard(config)]) for i in range(0, scenes, scenes_per_shard(config))]
+    began = time.perf_counter()
+    whole = [s for s in shards if len(s["obj_id"]) == config.shard_size]
+    size = sum(
+        len(data) for i, s in enumerate(whole) for data in shard.encode({**card, "n": 10**9}, i, s).files.values()
+    )
+    encode = (time.perf_counter() - began) / (len(whole) * config.shard_size)
+    maker.close()
+    found = {name: 1e3 * seconds / pairs for name, seconds in watch.seconds.items()}
+    found["background, sensor"] = found.pop("render, background, sensor") - found["render"]
+    found["other"] = 1e3 * total / pairs - sum(found.values())
+    found["encode"] = 1e3 * encode
+    return {
+        "ms_per_pair": {name: round(value, 3) for name, value in found.items()},
+        "ms_per_pair_in_all": round(sum(found.values()), 3),
+        "bytes_per_pair": size // (len(whole) * config.shard_size),
+    }
+
+
+def scenes_per_shard(config: SynthConfig) -> int:
+    """Scenes in a full shard."""
+    return config.shard_size // config.hypotheses_per_scene
+
+
+def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
+    """Pairs a second of the command, from its first shard to its last."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "shards"
+        process = subprocess.Popen(
+            [*command, "--n", str(arguments.pairs), "--workers", str(arguments.workers), "--out", str(out), "--quiet"],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        seen: list[tuple[float, int]] = []
+        manifest = out / "manifest.jsonl"
+        while process.poll() is None:
+            count = 0
+            if manifest.is_file():
+                count = sum(json.loads(line)["n"] for line in manifest.read_text().splitlines())
+            if count and (not seen or count > seen[-1][1]):
+                seen.append((time.perf_counter(), count))
+            time.sleep(0.02)
+        if process.returncode:
+            assert process.stderr is not None
+            sys.exit(process.stderr.read())
+    # the first shards of all workers come together: the clock starts when the last of them is there
+    first = seen[min(arguments.workers, len(seen) - 1) - 1]
+    return (seen[-1][1] - first[1]) / (seen[-1][0] - first[0])
+
+
+def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
+    """Time a scene and memory of one process at the beginning and at the end of many scenes."""
+    limit_threads(1)
+    maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
+    process, h = psutil.Process(), config.hypotheses_per_scene
+    seconds, rss = [], []
+    for scene in range(scenes):
+        began = time.perf_counter()
+        maker.samples(scene)
+        seconds.append(time.perf_counter() - began)
+        rss.append(process.memory_info().rss)
+    maker.close()
+    start, span = -(-100 // h), max(1, scenes // 10)
+    early, late = seconds[start : start + span], seconds[-span:]
+    return {
+        "scenes": scenes,
+        "pairs": scenes * h,
+        "scene_ms_from_pair_100": round(1e3 * statistics.median(early), 2),
+        "scene_ms_at_the_end": round(1e3 * statistics.median(late), 2),
+        "end_over_start": round(statistics.median(late) / statistics.median(early), 3),
+        "memory_growth_mb_from_pair_100": round((rss[-1] - rss[start]) / 1e6, 1),
+    }
+
+
+def peer(arguments: argparse.Namespace, config: SynthConfig, mesh: Mesh, denoiser: str) -> float:
+    """Seconds a pair of BlenderProc."""
+    camera: Camera = config.camera.camera()
+    side_px = make_target(1, mesh, config).window_side_px
+    near_m, far_m = config.distance.range_m(mesh.diameter_m)
+    command = [arguments.blenderproc_python, str(Path(__file__).with_name("blenderproc_pairs.py"))]
+    command += ["--mesh", str(arguments.object.resolve()), "--side", str(config.patch_px)]
+    command += ["--diameter", str(mesh.diameter_m * 1e3), "--samples", str(config.samples)]
+    command += ["--focal", str(float(camera.K[0, 0]) * config.patch_px / side_px)]
+    command += ["--distance", str(near_m / mesh.diameter_m), str(far_m / mesh.diameter_m)]
+    command += ["--pairs", str(arguments.peer_pairs), "--denoiser", denoiser]
+    settings = {"USE_EXTERNAL_BPY_MODULE": "1", "PYTHONPATH": str(arguments.blenderproc.resolve())}
+    done = subprocess.run(command, env={**os.environ, **settings}, capture_output=True, text=True, check=False)
+    lines = [line for line in done.stdout.splitlines() if line.startswith('{"s_per_pair"')]
+    if done.returncode or not lines:
+        sys.exit(f"BlenderProc failed:\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}")
+    return float(json.loads(lines[-1])["s_per_pair"])
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--object", type=Path, default=Path("examples/objects/tug.ply"), help="mesh in millimetres")
+    parser.add_argument("--engine", default="cycles", choices=["cycles", "eevee", "raster"])
+    parser.add_argument("--preset", default="default")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--pairs", type=int, default=1536, help="pairs of a throughput run")
+    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--stage-scenes", type=int, default=64)
+    parser.add_argument("--flat-scenes", type=int, default=0, help="also render this many scenes in one process")
+    parser.add_argument("--blenderproc", type=Path, metavar="DIR")
+    parser.add_argument("--blenderproc-python", metavar="PYTHON")
+    parser.add_argument("--peer-pairs", type=int, default=20)
+    arguments = parser.parse_args()
+    if (arguments.blenderproc is None) != (arguments.blenderproc_python is None):
+        parser.error("--blenderproc and --blenderproc-python go together")
+    config = load_config(arguments.preset, arguments.overrides, {"engine": arguments.engine})
+    mesh = load_mesh(arguments.object, units="mm")
+    command = [sys.executable, "-m", "synthgen.cli", "render", "--object", str(arguments.object)]
+    command += ["--engine", arguments.engine, "--preset", arguments.preset]
+    command += [part for override in arguments.overrides for part in ("--set", override)]
+    rates: list[float] = []
+    peers: dict[str, list[float]] = {"none": [], "default": []}
+    for _ in range(arguments.rounds):
+        rates.append(throughput(arguments, command))
+        print(f"synthgen, {arguments.workers} workers: {rates[-1]:.1f} pairs/s", flush=True)
+        if arguments.blenderproc is not None:
+            for denoiser, seconds in peers.items():
+                seconds.append(peer(arguments, config, mesh, denoiser))
+                print(f"BlenderProc, denoiser {denoiser}: {seconds[-1]:.3f} s a pair", flush=True)
+    found: Fields = {
+        "engine": config.engine,
+        "patch_px": config.patch_px,
+        "samples": config.samples,
+        "hypotheses_per_scene": config.hypotheses_per_scene,
+        "workers": arguments.workers,
+        "pairs_per_s": round(statistics.median(rates), 2),
+        "pairs_per_s_all": [round(rate, 2) for rate in rates],
+    }
+    if arguments.blenderproc is not None:
+        for denoiser, seconds in peers.items():
+            found[f"blenderproc_{denoiser}_s_per_pair"] = round(statistics.median(seconds), 4)
+            ratios = np.multiply(seconds, rates)
+            found[f"times_blenderproc_{denoiser}"] = round(float(np.median(ratios)), 1)
+    found |= stages(config, mesh, arguments.stage_scenes)
+    for name, value in found["ms_per_pair"].items():
+        print(f"{name:24s} {value:8.3f} ms a pair")
+    if arguments.flat_scenes:
+        found["flat"] = flatness(config, mesh, arguments.flat_scenes)
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
