@@ -6,10 +6,10 @@
 
 Throughput is measured on the real command with all its workers, from the first shard on disk to the last. Stages are
 measured in this process, one worker's work on one core. With `--blenderproc` (a source checkout of BlenderProc and a
-Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh at the same side, distances and samples
-per pixel in turn with ours: one scene and one hypothesis image a pair, depth and segmentation with both, with its
-default denoiser and with none, on all cores. It renders no occluders, background, contours or distance transforms and
-writes no file. The last line is JSON.
+Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh at the same side, distances and
+samples per pixel in turn with ours: one scene and one hypothesis image a pair, depth and segmentation with both, with
+its default denoiser and with none, on all cores. It renders no occluders, background, contours or distance transforms
+and writes no file. The last line is JSON.
 """
 
 import argparse
