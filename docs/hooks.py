@@ -12,6 +12,7 @@ import click
 import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ("synthgen", "refinenet", "evalkit")
@@ -28,6 +29,23 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
     return files
+
+
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Put the table of checks where a page asks for it (called by mkdocs)."""
+    return markdown.replace("<!-- checks -->", checks_table())
+
+
+def checks_table() -> str:
+    """Return what `synthgen verify` checks, from its own list."""
+    findings = importlib.import_module("synthgen.verify.findings")
+    rows = [(name, _cell(what), tolerance) for name, (what, tolerance) in findings.DATASET_CHECKS.items()]
+    for check in importlib.import_module("synthgen.verify.checks").CHECKS:
+        what = f"{check.what} On the samples drawn again." if check.drawn else check.what
+        text = f"{_cell(what)}<br><small>Tolerance: {_cell(check.why)}.</small>"
+        rows.append((check.name, text, findings.tolerance_text(check.tolerance, check.unit)))
+    lines = ["| check | what holds | tolerance |", "|---|---|---|"]
+    return "\n".join([*lines, *(f"| {name} | {what} | {_cell(tolerance)} |" for name, what, tolerance in rows)])
 
 
 def commands(program: str) -> Iterator[tuple[str, click.Command]]:
@@ -99,17 +117,23 @@ def data_format_page() -> str:
         "with one array per field and the native sharding codec. Every array has the sample axis in front. `P` is the "
         "patch side in pixels and `C` the number of contour points, both in the data card.",
         "",
-        "| field | on disk | shape | unit | scale | what |",
-        "|---|---|---|---|---|---|",
+        "| field | on disk | shape | unit | scale | codecs | what |",
+        "|---|---|---|---|---|---|---|",
     ]
     for name, field in spec["fields"].items():
         shape = " x ".join(["n", *map(str, field["shape"])])
         scale = field.get("scale", "")
         scale = f"{scale:g}" if isinstance(scale, float) else scale
-        lines.append(f"| `{name}` | {field['dtype']} | {shape} | {field['unit']} | {scale} | {_cell(field['text'])} |")
+        scale = "squared" if field.get("squared") else scale
+        cells = (f"`{name}`", field["dtype"], shape, field["unit"], scale, field["codec"], _cell(field["text"]))
+        lines.append(f"| {' | '.join(cells)} |")
     lines += [
         "",
-        "A stored integer times its scale is the value in the unit; `posecore.shard.ShardReader` does that. "
+        "A stored integer times its scale is the value in the unit, and the root of a stored square is a distance: "
+        "`posecore.shard.ShardReader` does both. All codecs are lossless. They are those of the Zarr v3 specification "
+        "(`transpose`, called planes here, `zstd`, `blosc` with shuffle, `crc32c` after each chunk) and "
+        "`numcodecs.delta`, which zarr-python brings along: "
+        "`zarr.open_group(url)` reads every array as it is stored, with unit, scale and squared in its attributes. "
         "`depth_step_m` stands in the data card: 0.1 mm, doubled as often as the deepest scene of a very large object "
         "needs.",
         "",

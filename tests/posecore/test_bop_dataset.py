@@ -7,7 +7,16 @@ import cv2
 import numpy as np
 import pytest
 from posecore import se3
-from posecore.bop import BopDataset, BopWriter, GroundTruth, ModelInfo, Target, write_models, write_targets
+from posecore.bop import (
+    BopDataset,
+    BopWriter,
+    GroundTruth,
+    ModelInfo,
+    Target,
+    visible_targets,
+    write_models,
+    write_targets,
+)
 from posecore.bop.images import image_size, read_rgb, write_image
 from posecore.bop.writer import gt_info
 from posecore.camera import Camera
@@ -118,20 +127,75 @@ def test_box_reaches_outside_the_image(tmp_path):
     gts = [GroundTruth(obj_id=1, T_cam_obj=pose(1))]
     inside = canvas[20 : 20 + HEIGHT, 20 : 20 + WIDTH]
     writer.add_frame(0, rgb, None, camera(), gts, [canvas], [inside], mask_origin_px=(20, 20))
+    writer.close()
     entry = json.loads((tmp_path / "test/000001/scene_gt_info.json").read_text())["0"][0]
     assert entry["bbox_obj"] == [-10, 0, 24, 4]
     assert entry["bbox_visib"] == [0, 0, 14, 4]
     assert (entry["px_count_all"], entry["px_count_visib"], entry["visib_fract"]) == (125, 75, 0.6)
 
 
-def test_frames_count_once_their_json_is_written(dataset_path, monkeypatch):
+def test_frames_count_once_they_are_noted(dataset_path, monkeypatch):
     """A writer killed after its images leaves the dataset as it was."""
     writer = BopWriter(dataset_path, "test", 3)
-    monkeypatch.setattr(writer, "_commit", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(writer, "commit", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         write_frame(writer, 1)
     assert (dataset_path / "test/000003/rgb/000001.png").is_file()
+    assert BopWriter(dataset_path, "test", 3).im_ids == [0]
     assert BopDataset(dataset_path).im_ids(3) == [0]
+
+
+def test_the_journal_of_a_killed_writer_is_taken_up(dataset_path):
+    """Its frames count; a line that was cut off does not, and is not in the way of the next one."""
+    killed = BopWriter(dataset_path, "test", 3)
+    write_frame(killed, 4)
+    write_frame(killed, 5)
+    journal = dataset_path / "test/000003/.frames.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-20])
+    assert BopDataset(dataset_path).im_ids(3) == [0]
+    with BopWriter(dataset_path, "test", 3) as writer:
+        assert writer.im_ids == [0, 4]
+        write_frame(writer, 7)
+    assert not journal.exists()
+    assert BopDataset(dataset_path).im_ids(3) == [0, 4, 7]
+    assert len(BopDataset(dataset_path).gt(3, 4)) == 1
+    with pytest.raises(DatasetError, match="image 8: the scene is closed"):
+        write_frame(writer, 8)
+
+
+def test_what_is_written_for_a_frame_does_not_grow_with_the_scene(tmp_path):
+    rgb, mask = np.zeros((HEIGHT, WIDTH, 3), np.uint8), box_mask(0, 0, 4, 4)
+    sizes = []
+    with BopWriter(tmp_path, "test", 1) as writer:
+        for im_id in range(40):
+            truth = GroundTruth(obj_id=1, T_cam_obj=pose(1))
+            writer.add_frame(im_id, rgb, None, camera(), [truth], [mask], [mask])
+            sizes.append((tmp_path / "test/000001/.frames.jsonl").stat().st_size)
+            assert not (tmp_path / "test/000001/scene_gt.json").exists()
+    assert max(np.diff(sizes)) <= min(np.diff(sizes)) + 1
+    assert BopDataset(tmp_path).im_ids(1) == list(range(40))
+
+
+def test_targets_count_instances_that_are_visible_enough(tmp_path):
+    rgb, full = np.zeros((HEIGHT, WIDTH, 3), np.uint8), box_mask(0, 0, 10, 10)
+    parts = [box_mask(0, 0, 10, 1), box_mask(0, 0, 9, 1), full, box_mask(0, 0, 0, 0)]
+    gts = [GroundTruth(obj_id=i, T_cam_obj=pose(i)) for i in (2, 2, 2, 7)]
+    with BopWriter(tmp_path, "test", 4) as writer:
+        writer.add_frame(3, rgb, None, camera(), gts, [full] * 4, parts)
+        writer.add_frame(9, rgb, None, camera(), gts[:1], [full], parts[3:])
+    targets = visible_targets(tmp_path, "test", 4)
+    assert targets == [Target(scene_id=4, im_id=3, obj_id=2, inst_count=2)]
+    write_targets(tmp_path, "test", targets)
+    assert json.loads((tmp_path / "test_targets_bop24.json").read_text()) == [{"im_id": 3, "scene_id": 4}]
+
+
+def test_the_world_pose_is_bops(tmp_path):
+    rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    with BopWriter(tmp_path, "test", 1) as writer:
+        writer.add_frame(0, rgb, None, camera(), [], [], [], T_cam_world=pose(3))
+    entry = json.loads((tmp_path / "test/000001/scene_camera.json").read_text())["0"]
+    assert np.allclose(np.reshape(entry["cam_R_w2c"], (3, 3)), pose(3)[:3, :3])
+    assert np.allclose(np.array(entry["cam_t_w2c"]) / 1000, pose(3)[:3, 3])
 
 
 def test_writer_continues_and_replaces(dataset_path):

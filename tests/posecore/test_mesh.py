@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from posecore.errors import MeshError
-from posecore.mesh import diameter, load_mesh, save_ply
+from posecore.mesh import Mesh, diameter, load_mesh, save_ply
 
 
 def write_box(path: Path, extents: tuple[float, float, float] = (60, 40, 30)) -> Path:
@@ -43,6 +43,26 @@ def test_saved_ply_loads_the_same(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.faces, mesh.faces)
     np.testing.assert_array_equal(again.colours, mesh.colours)
     np.testing.assert_allclose(again.normals, mesh.normals, atol=1e-6)
+
+
+def test_a_saved_texture_lies_beside_the_ply_and_loads_again(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    corners = rng.normal(size=(12, 3)) * 0.05
+    mesh = Mesh(
+        vertices_m=corners,
+        faces=np.arange(12, dtype=np.int32).reshape(4, 3),
+        normals=np.tile(np.array([0, 0, 1], np.float32), (12, 1)),
+        uv=rng.random((12, 2)).astype(np.float32),
+        texture_rgb=rng.integers(0, 256, (16, 24, 3), np.uint8),
+    )
+    save_ply(mesh, tmp_path / "copy.ply")
+    copy = load_mesh(tmp_path / "copy.ply")
+    assert copy.uv is not None and copy.texture_rgb is not None and mesh.texture_rgb is not None
+    np.testing.assert_array_equal(copy.texture_rgb, mesh.texture_rgb)
+    np.testing.assert_array_equal(copy.uv, mesh.uv)
+    (tmp_path / "copy.png").unlink()
+    with pytest.raises(MeshError, match=r"its texture .*copy\.png is missing"):
+        load_mesh(tmp_path / "copy.ply")
 
 
 def test_diameter_is_the_largest_vertex_distance() -> None:
@@ -153,6 +173,13 @@ def test_a_texture_that_is_no_image_is_an_error_not_grey(tmp_path: Path) -> None
     whole = cv2.imencode(".png", noise)[1].tobytes()
     with pytest.raises(MeshError, match=r"a.obj: its texture cannot be decoded"):
         load_mesh(write_obj(tmp_path, whole[: len(whole) // 2]))
+
+
+@pytest.mark.parametrize("texture", [None, b"nothing", b"\x89PNG\r\n\x1a\nand then nothing"])
+def test_a_bad_texture_is_passed_over_when_told_to(tmp_path: Path, texture: bytes | None) -> None:
+    mesh = load_mesh(write_obj(tmp_path, texture), allow_missing_textures=True)
+    assert mesh.texture_rgb is None
+    assert len(mesh.colours) == len(mesh.vertices_m)
 
 
 def test_a_missing_gltf_texture_is_an_error_not_grey(shared_data: Path, tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """Shard datasets: round trip within the stated quantisation, commits, damage and foreign data."""
 
 import json
+import pickle
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
+from numcodecs import blosc
 from posecore import shard
 from posecore.errors import ShardError, StorageError
+from posecore.shard.memory import Recycler
 
 CARD = {"n": 10, "shard_size": 4, "patch_px": 16, "contour_points": 5, "depth_step_m": 1e-4, "seed": 3}
 
@@ -17,7 +21,9 @@ def samples(count: int, seed: int) -> dict[str, np.ndarray]:
     values = {}
     for field in shard.field_table():
         shape = (count, *field.size(16, 5))
-        if field.scale is None and not field.dtype.startswith("float"):
+        if field.squared:
+            values[field.name] = np.sqrt(rng.integers(0, 100_000, shape)).astype(np.float32)
+        elif field.scale is None and not field.dtype.startswith("float"):
             values[field.name] = rng.integers(0, 200, shape).astype(field.dtype)
         else:
             values[field.name] = rng.uniform(0, 5, shape)
@@ -44,8 +50,9 @@ def test_round_trip_within_half_a_step(tmp_path: Path, kind: str) -> None:
         wanted, found = samples(shard.samples_in(CARD, i), i), reader.read(i)
         for field in shard.field_table():
             step = (field.step(CARD) or 0) / 2 + 1e-6 if field.scale else 0
-            got = wanted[field.name].astype(field.dtype) if field.scale is None else wanted[field.name]
+            got = wanted[field.name].astype(field.decoded_dtype) if field.scale is None else wanted[field.name]
             np.testing.assert_allclose(found[field.name], got, atol=step, rtol=0 if field.scale is None else 1e-6)
+            assert found[field.name].dtype == field.decoded_dtype and found[field.name].flags["C_CONTIGUOUS"]
 
 
 def test_fields_that_are_all_zero_come_back_as_zero(tmp_path: Path) -> None:
@@ -58,19 +65,73 @@ def test_fields_that_are_all_zero_come_back_as_zero(tmp_path: Path) -> None:
     np.testing.assert_array_equal(zarr.open_group(tmp_path / "d", mode="r")["scene_mask"][:4], 0)
 
 
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs")
 def test_any_zarr_reader_opens_it(tmp_path: Path) -> None:
     write(str(tmp_path / "d"))
     group = zarr.open_group(tmp_path / "d", mode="r")
     assert group.attrs["schema"] == "posepair"
-    assert group["scene_rgb"].shape == (10, 16, 16, 3)
-    np.testing.assert_array_equal(group["T_cam_obj"][4:8], samples(4, 1)["T_cam_obj"])
-    assert group["scene_rgb"].shards == (4, 16, 16, 3)
+    assert sorted(name for name, _ in group.arrays()) == sorted(field.name for field in shard.field_table())
+    for field in shard.field_table():
+        array = group[field.name]
+        wanted = np.concatenate([samples(shard.samples_in(CARD, i), i)[field.name] for i in range(3)])
+        assert array.shape == wanted.shape and array.dtype == field.dtype
+        np.testing.assert_array_equal(array[:], field.encode(wanted, CARD))
+        np.testing.assert_array_equal(array[6], field.encode(wanted, CARD)[6])  # one sample alone
+        assert array.shards == (4, *wanted.shape[1:]) and array.attrs["unit"] == field.unit
+
+
+@pytest.mark.filterwarnings("ignore:Numcodecs codecs")
+def test_what_zarr_writes_is_read(tmp_path: Path) -> None:
+    """zarr-python is the reference twin of our shard files, in both directions."""
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
+    group = zarr.open_group(tmp_path / "d", mode="r+")
+    for field in shard.field_table():
+        group[field.name][4:8] = field.encode(samples(4, 1)[field.name], CARD)
+    line = writer.encode(1, samples(4, 1)).line
+    line["bytes"] = {f.name: (tmp_path / "d" / key_of(f, 1)).stat().st_size for f in shard.field_table()}
+    (tmp_path / "d/manifest.jsonl").write_text(json.dumps(line) + "\n")
+    names = [field.name for field in shard.field_table()]
+    write(str(tmp_path / "own"))
+    found, own = (shard.ShardReader(str(tmp_path / d)).read(1, names) for d in ("d", "own"))
+    for name in names:
+        np.testing.assert_array_equal(found[name], own[name])
+
+
+def key_of(field: shard.Field, shard_id: int) -> str:
+    return "/".join([field.name, "c", str(shard_id), *["0"] * len(field.shape)])
+
+
+def test_bytes_do_not_depend_on_threads() -> None:
+    card = {**CARD, "n": 8, "shard_size": 8, "patch_px": 160}
+    rng = np.random.default_rng(0)
+    arrays = {f.name: rng.integers(0, 3, (8, *f.size(160, 5))).astype(f.dtype) for f in shard.field_table()}
+    for field in shard.field_table():
+        if field.squared:
+            arrays[field.name] = np.sqrt(arrays[field.name])
+    alone = shard.encode(card, 0, arrays)
+    with ThreadPoolExecutor(4) as pool:
+        others = list(pool.map(lambda _: shard.encode(card, 0, arrays), range(8)))
+    assert all(other.files == alone.files for other in others)
+    before = blosc.set_nthreads(8)
+    try:
+        assert shard.encode(card, 0, arrays).files == alone.files
+    finally:
+        blosc.set_nthreads(before)
 
 
 def test_bytes_do_not_depend_on_the_order_of_commits(tmp_path: Path) -> None:
     write(str(tmp_path / "a"), (0, 1, 2))
     write(str(tmp_path / "b"), (2, 0, 1))
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
+
+
+def test_two_writers_in_turn_lose_no_line(tmp_path: Path) -> None:
+    """Each keeps the manifest's lines in mind, and sees that the other one has changed them."""
+    one, other = (shard.ShardWriter.create(str(tmp_path / "d"), CARD) for _ in range(2))
+    for writer, i in ((one, 0), (other, 2), (one, 1)):
+        writer.commit(writer.encode(i, samples(shard.samples_in(CARD, i), i)))
+    write(str(tmp_path / "whole"))
+    assert contents(tmp_path / "d") == contents(tmp_path / "whole")
 
 
 def test_reopening_the_same_dataset_keeps_what_is_there(tmp_path: Path) -> None:
@@ -159,7 +220,7 @@ def test_another_schema_version_is_refused(tmp_path: Path) -> None:
     group = json.loads((tmp_path / "d/zarr.json").read_text())
     group["attributes"]["schema_version"] = 99
     (tmp_path / "d/zarr.json").write_text(json.dumps(group))
-    with pytest.raises(ShardError, match="version 99, expected posepair version 1"):
+    with pytest.raises(ShardError, match="version 99, expected posepair version 2"):
         shard.ShardReader(str(tmp_path / "d"))
 
 
@@ -173,6 +234,48 @@ def test_no_dataset_and_broken_manifest(tmp_path: Path) -> None:
         shard.ShardReader(str(tmp_path / "d"))
 
 
+def test_a_flipped_bit_is_found_when_few_fields_are_read(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"))
+    file = tmp_path / "d/scene_mask/c/1/0/0"
+    data = bytearray(file.read_bytes())
+    data[10] ^= 1
+    file.write_bytes(data)
+    with pytest.raises(ShardError, match=r"scene_mask/c/1/0/0: does not decode \(checksum differs\).*shard is damaged"):
+        shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_mask"])
+    shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_rgb"])
+
+
+def test_memory_is_used_again_only_when_nobody_can_see_it() -> None:
+    recycler, shape, kind = Recycler(), (2**18,), np.dtype(np.float32)
+    first = recycler.empty(shape, kind)
+    first[:] = 1
+    second = recycler.empty(shape, kind)
+    assert not np.shares_memory(first, second)
+    place, view = first.ctypes.data, first[5:7]
+    del first
+    third = recycler.empty(shape, kind)
+    third[:] = 3
+    assert view.tolist() == [1, 1]
+    del view
+    assert recycler.empty(shape, kind).ctypes.data == place
+    assert recycler.empty((4,), kind).shape == (4,) and recycler.empty(shape, np.dtype(np.int32)).dtype == np.int32
+    assert pickle.loads(pickle.dumps(recycler)).empty(shape, kind).ctypes.data != place
+
+
+def test_what_was_read_stays_as_it_was(tmp_path: Path) -> None:
+    """Arrays of one shard are not filled with the next one while a sample of them is in use."""
+    card = {**CARD, "n": 8, "patch_px": 256}
+    writer = shard.ShardWriter.create(str(tmp_path / "d"), card)
+    for i in range(2):
+        arrays = {f.name: np.full((4, *f.size(256, 5)), i) for f in shard.field_table()}
+        writer.commit(writer.encode(i, arrays))
+    reader = shard.ShardReader(str(tmp_path / "d"))
+    kept = {name: values[2] for name, values in reader.read(0).items()}
+    for _ in range(3):
+        assert all((values == 1).all() for name, values in reader.read(1).items() if not name.endswith("depth_m"))
+    assert all((values == 0).all() for values in kept.values())
+
+
 def test_values_out_of_range_and_missing_fields_are_refused(tmp_path: Path) -> None:
     writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
     arrays = samples(4, 0)
@@ -180,6 +283,11 @@ def test_values_out_of_range_and_missing_fields_are_refused(tmp_path: Path) -> N
         writer.encode(0, {**arrays, "scene_depth_m": np.full((4, 16, 16), 7.0)})
     with pytest.raises(ShardError, match="hypothesis_depth_m: values from nan"):
         writer.encode(0, {**arrays, "hypothesis_depth_m": np.full((4, 16, 16), np.nan)})
+    for wrong in (0.5, -1.0, np.nan, 70_000.0):
+        distance = arrays["scene_distance_px"].copy()
+        distance[2, 3, 4] = wrong
+        with pytest.raises(ShardError, match=r"scene_distance_px: values from .* squares are whole numbers"):
+            writer.encode(0, {**arrays, "scene_distance_px": distance})
     with pytest.raises(ShardError, match="K_crop: found nothing"):
         writer.encode(0, {k: v for k, v in arrays.items() if k != "K_crop"})
     with pytest.raises(ShardError, match="obj_id: found"):

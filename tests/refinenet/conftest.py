@@ -100,7 +100,12 @@ def make_dataset(
         "n": n, "shard_size": shard_size, "patch_px": patch_px, "contour_points": contour_points, "seed": 0,
         "depth_step_m": 1e-4,
         "config": {}, "camera": {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
-        "objects": {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": side_px}},
+        "objects": {
+            "1": {
+                "name": "thing", "path": "models/obj_000001.ply",
+                "diameter_m": mesh.diameter_m, "window_side_px": side_px,
+            }
+        },
     }  # fmt: skip
     writer = ShardWriter.create(str(folder), card)
     save_ply(mesh, folder / "models" / "obj_000001.ply", units="mm")

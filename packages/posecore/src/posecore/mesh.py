@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +20,8 @@ from scipy.spatial.distance import cdist
 
 from posecore.errors import MeshError
 from posecore.files import write_atomic
+
+logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
 
 Array = np.ndarray
 Units = Literal["mm", "cm", "m"]
@@ -112,12 +115,14 @@ def diameter(points_m: Float[Array, "v 3"]) -> float:
     return max(float(cdist(points[i : i + 512], points[i:]).max()) for i in blocks)
 
 
-def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
+def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: bool = False) -> Mesh:
     """Read a PLY, OBJ, glTF, GLB, STL or OFF file.
 
     Args:
         path: The file. Several geometries in one file are merged.
         units: Unit of the file's coordinates. glTF is in metres by its specification: say `m`.
+        allow_missing_textures: Whether a mesh whose texture or material file is missing or broken has its vertex
+            colours or its material's plain colour instead.
 
     Raises:
         MeshError: Missing, unreadable, without faces, with NaN vertices, with a face that names a vertex that is not
@@ -140,7 +145,9 @@ def load_mesh(path: str | Path, *, units: Units = "mm") -> Mesh:
             f"{file}: face {bad} names the vertices {faces[bad].tolist()}, expected 0 to {len(vertices) - 1}; "
             "repair the mesh"
         )
-    vertex_rgb, uv, texture_rgb = _appearance(file, geometry)
+    if not allow_missing_textures:
+        _refuse_missing_texture(file)
+    vertex_rgb, uv, texture_rgb = _appearance(file, geometry, allow_missing_textures)
     mesh = Mesh(
         vertices_m=vertices * METRES_PER_UNIT[units],
         faces=faces,
@@ -196,18 +203,17 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
 
 
 def _appearance(
-    file: Path, geometry: trimesh.Trimesh
+    file: Path, geometry: trimesh.Trimesh, allow_missing_textures: bool
 ) -> tuple[UInt8[Array, "v 3"] | None, Float[Array, "v 2"] | None, UInt8[Array, "h w 3"] | None]:
-    _refuse_missing_texture(file)
     visual: Any = geometry.visual
     material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is not None and visual.uv is not None:
         try:
-            texture_rgb = np.asarray(image.convert("RGB"), np.uint8)
+            return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
         except OSError as error:
-            raise MeshError(f"{file}: its texture cannot be decoded ({error}); export it again") from error
-        return None, np.asarray(visual.uv, np.float32), texture_rgb
+            if not allow_missing_textures:
+                raise MeshError(f"{file}: its texture cannot be decoded ({error}); export it again") from error
     if material is not None:
         plain = np.asarray(material.main_color, np.uint8)[:3]
         return np.tile(plain, (len(geometry.vertices), 1)), None, None
@@ -231,6 +237,9 @@ def _textures(file: Path) -> list[Path]:
         images = json.loads(file.read_text(encoding="utf-8")).get("images", ())
         links = [image["uri"] for image in images if not image.get("uri", "data:").startswith("data:")]
         return [file.parent / unquote(link) for link in links]
+    if file.suffix.lower() == ".ply":
+        header = file.read_bytes().split(b"end_header", 1)[0].decode("ascii", "replace").splitlines()
+        return [file.parent / line.split(maxsplit=2)[2].strip() for line in header if _names_texture(line)]
     if file.suffix.lower() != ".obj":
         return []
     found = []
@@ -245,9 +254,22 @@ def _textures(file: Path) -> list[Path]:
     return found
 
 
+def _names_texture(line: str) -> bool:
+    """Whether a line of a PLY's header names an image."""
+    return line.startswith("comment TextureFile ")
+
+
 def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
-    """Write a binary PLY with vertex normals and colours (a texture is sampled at the vertices)."""
+    """Write a binary PLY with vertex normals and colours.
+
+    A texture goes as a PNG of the same name beside it, named in the PLY as BOP's models do (`comment TextureFile`,
+    texture_u, texture_v); the vertex colours are then the texture sampled at the vertices, for readers that take no
+    textures.
+    """
     columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
+    textured = mesh.uv is not None and mesh.texture_rgb is not None
+    if textured:
+        columns += [("texture_u", "<f4"), ("texture_v", "<f4")]
     columns += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
     vertices = np.empty(len(mesh.vertices_m), columns)
     for axis, name in enumerate("xyz"):
@@ -255,12 +277,19 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
         vertices["n" + name] = mesh.normals[:, axis]
     for channel, name in enumerate(("red", "green", "blue")):
         vertices[name] = mesh.colours[:, channel]
+    comment = ""
+    if mesh.uv is not None and mesh.texture_rgb is not None:
+        vertices["texture_u"], vertices["texture_v"] = mesh.uv[:, 0], mesh.uv[:, 1]
+        texture = Path(path).with_suffix(".png")
+        comment = f"comment TextureFile {texture.name}\n"
+        _, data = cv2.imencode(".png", mesh.texture_rgb[..., ::-1])
+        write_atomic(texture, data.tobytes())  # before the PLY, which names it
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", (3,))])
     faces["count"], faces["index"] = 3, mesh.faces
     names = {"<f4": "float", "u1": "uchar"}
     properties = "".join(f"property {names[kind]} {name}\n" for name, kind in columns)
     header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n{properties}"
+        f"ply\nformat binary_little_endian 1.0\n{comment}element vertex {len(vertices)}\n{properties}"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     write_atomic(path, header.encode() + vertices.tobytes() + faces.tobytes())

@@ -1,5 +1,7 @@
 """Where a dataset's files lie: a local folder, or any fsspec URL (s3://, gs://, memory://)."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,6 +21,9 @@ class Store(Protocol):
 
     def list_names(self) -> list[str]:
         """Names at the top of the folder, sorted."""
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of every file below a folder, by key; empty when there is none."""
 
 
 class LocalStore:
@@ -49,6 +54,11 @@ class LocalStore:
             raise StorageError(f"{self.root}: is a file, expected a folder for the dataset; choose another path")
         return sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".tmp"))
 
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of every file below a folder, by key."""
+        files = (p for p in (self.root / folder).rglob("*") if p.is_file())
+        return {p.relative_to(self.root).as_posix(): p.stat().st_size for p in files}
+
 
 class FsspecStore:
     """Any filesystem that fsspec knows. Object stores write a whole object or none."""
@@ -59,32 +69,85 @@ class FsspecStore:
         try:
             self._fs, self._root = fsspec.core.url_to_fs(url)
         except (ValueError, ImportError) as error:
-            raise ConfigError(f"{url}: {str(error).splitlines()[0]}") from error
+            raise ConfigError(f"{url}: {str(error).splitlines()[0]}{_install_hint(url)}") from error
         self._url = url
 
     def get(self, key: str) -> bytes | None:
         """Bytes of an object, None when it is absent."""
-        try:
-            return bytes(self._fs.cat_file(f"{self._root}/{key}"))
-        except FileNotFoundError:
-            return None
+        with self._errors(key):
+            try:
+                return bytes(self._fs.cat_file(f"{self._root}/{key}"))
+            except FileNotFoundError as error:
+                if _says_no_bucket(error):
+                    raise
+        return None
 
     def set(self, key: str, data: bytes) -> None:
         """Write an object."""
         path = f"{self._root}/{key}"
-        try:
-            self._fs.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
-            self._fs.pipe_file(path, data)
-        except OSError as error:
-            raise storage_error(f"{self._url}/{key}", error, len(data)) from error
+        with self._errors(key, len(data)):
+            try:
+                self._fs.pipe_file(path, data)
+            except FileNotFoundError as error:  # a filesystem with real folders
+                if _says_no_bucket(error):  # making folders would make the bucket
+                    raise
+                self._fs.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
+                self._fs.pipe_file(path, data)
 
     def list_names(self) -> list[str]:
         """Names at the top of the URL."""
-        try:
-            entries: list[Any] = self._fs.ls(self._root, detail=False)
-        except FileNotFoundError:
-            return []
+        with self._errors():
+            self._fs.invalidate_cache()
+            try:
+                entries: list[Any] = self._fs.ls(self._root, detail=False)
+            except FileNotFoundError as error:
+                if _says_no_bucket(error):
+                    raise
+                return []
         return sorted(str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in entries)
+
+    def sizes(self, folder: str) -> dict[str, int]:
+        """Bytes of every object below a folder, by key."""
+        with self._errors(folder):
+            self._fs.invalidate_cache()
+            found: dict[str, Any] = self._fs.find(f"{self._root}/{folder}", detail=True)
+        start = len(str(self._root).strip("/")) + 1
+        return {path.strip("/")[start:]: int(entry["size"]) for path, entry in found.items()}
+
+    @contextmanager
+    def _errors(self, key: str = "", size_bytes: int | None = None) -> Iterator[None]:
+        """Turn whatever a backend raises (few of them raise OSError only) into one line that says what to do."""
+        where = f"{self._url}/{key}" if key else self._url
+        try:
+            yield
+        except Exception as error:
+            name, text = type(error).__name__, (str(error).splitlines() or [""])[0]
+            if "Credential" in name:
+                advice = (
+                    "no credentials found; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY or AWS_PROFILE"
+                    if self._url.startswith("s3")
+                    else f"no credentials found ({text}); log in to this store"
+                )
+            elif isinstance(error, FileNotFoundError) and _says_no_bucket(error):
+                advice = "the bucket does not exist; create it"
+            elif isinstance(error, PermissionError):
+                advice = f"access denied ({text}); use credentials that may read and write there"
+            elif "Connect" in name or "Timeout" in name or isinstance(error, ConnectionError | TimeoutError):
+                advice = f"cannot reach the store ({text}); check the network and, for S3 elsewhere, AWS_ENDPOINT_URL"
+            elif isinstance(error, OSError) and error.errno is not None:
+                raise storage_error(where, error, size_bytes) from error
+            else:
+                advice = f"the store answered {name}: {text}"
+            raise StorageError(f"{where}: {advice}, or choose another place") from error
+
+
+def _says_no_bucket(error: Exception) -> bool:
+    """Whether the bucket itself is missing; the filesystems have no error of its own for that."""
+    return "bucket does not exist" in str(error).lower()
+
+
+def _install_hint(url: str) -> str:
+    return "; pip install 'posecore[s3]'" if url.startswith("s3") else ""
 
 
 def open_store(url: str | Path) -> Store:

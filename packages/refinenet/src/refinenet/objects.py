@@ -28,9 +28,10 @@ def load_meshes(reader: ShardReader) -> dict[int, Mesh]:
     meshes = {}
     with tempfile.TemporaryDirectory() as folder:  # a dataset behind a URL has no paths to load from
         for obj_id in object_ids(reader):
-            name = f"obj_{obj_id:06d}.ply"
-            copy = Path(folder) / name
-            copy.write_bytes(reader.file(f"models/{name}"))
+            entry = reader.card["objects"][str(obj_id)]
+            for key in filter(None, (entry.get("texture"), entry["path"])):
+                copy = Path(folder) / Path(key).name
+                copy.write_bytes(reader.file(key))
             meshes[obj_id] = load_mesh(copy, units="mm")
     return meshes
 

@@ -3,20 +3,34 @@
 from posecore.bop.dataset import BopDataset, GroundTruth, Target
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
 from posecore.bop.results import Estimate, read_results, read_sidecar, sidecar_path, write_results
-from posecore.bop.writer import BopWriter, write_models, write_targets
+from posecore.bop.writer import (
+    BopWriter,
+    FrameEntry,
+    FrameFiles,
+    scene_folder,
+    visible_targets,
+    write_camera,
+    write_models,
+    write_targets,
+)
 
 __all__ = [
     "BopDataset",
     "BopWriter",
     "Estimate",
+    "FrameEntry",
+    "FrameFiles",
     "GroundTruth",
     "ModelInfo",
     "Target",
     "load_models_info",
     "read_results",
     "read_sidecar",
+    "scene_folder",
     "sidecar_path",
     "symmetry_transforms",
+    "visible_targets",
+    "write_camera",
     "write_models",
     "write_results",
     "write_targets",

@@ -1,7 +1,10 @@
 """Writing BOP datasets: a frame at a time, images first, the JSON that makes it count last."""
 
 import json
+import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,66 +18,48 @@ from posecore.bop.jsonfile import as_list, integer_keys, read_json, write_json
 from posecore.bop.models_info import MM, ModelInfo, save_models_info
 from posecore.camera import Camera
 from posecore.errors import DatasetError
-from posecore.files import write_atomic
+from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh, save_ply
 
 Array = np.ndarray
 SCENE_FILES = ("scene_gt_info.json", "scene_camera.json", "scene_gt.json")
-"""In writing order: a frame exists once scene_gt.json names it."""
+"""In writing order: scene_gt.json, which decides what frames there are, is the last."""
+JOURNAL = ".frames.jsonl"
 
 
-class BopWriter:
-    """Writes one scene. A scene that exists already is continued; a frame that exists is replaced."""
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameEntry:
+    """What the three JSON files of a scene say about one frame. Plain data: it may come from another process."""
 
-    def __init__(
-        self,
-        root: str | Path,
-        split: str,
-        scene_id: int,
-        *,
-        depth_scale: float = 0.1,
-        image_format: str = "png",
-        jpeg_quality: int = 95,
-    ) -> None:
-        """Open a scene for writing.
+    info: list[dict[str, Any]]
+    camera: dict[str, Any]
+    gt: list[dict[str, Any]]
 
-        Args:
-            root: dataset folder.
-            split: split folder's name.
-            scene_id: number of the scene folder.
-            depth_scale: millimetres for one step of the 16-bit depth image.
-            image_format: png or jpg.
-            jpeg_quality: 1 to 100, for jpg.
 
-        Raises:
-            DatasetError: another image format, or the scene's JSON files are broken.
-        """
-        if image_format not in ("png", "jpg"):
-            raise DatasetError(f"image format: found '{image_format}', expected png or jpg")
-        self.root = Path(root)
-        self.scene_path = self.root / split / f"{scene_id:06d}"
-        self.depth_scale, self.image_format, self.jpeg_quality = depth_scale, image_format, jpeg_quality
-        self._entries: dict[str, dict[int, str]] = {name: self._existing(name) for name in SCENE_FILES}
+@dataclass(frozen=True, kw_only=True)
+class FrameFiles:
+    """Writes the image files of frames, from any number of processes at once.
 
-    def _existing(self, name: str) -> dict[int, str]:
-        file = self.scene_path / name
-        content = integer_keys(read_json(file), file) if file.is_file() else {}
-        return {im_id: json.dumps(entry) for im_id, entry in content.items()}
+    Attributes:
+        scene_path: Folder of the scene.
+        depth_scale: Millimetres for one step of the 16-bit depth image.
+        image_format: png or jpg.
+        jpeg_quality: 1 to 100, for jpg.
 
-    def __enter__(self) -> "BopWriter":
-        """Use the writer in a with statement."""
-        return self
+    Raises:
+        DatasetError: Another image format.
+    """
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Close the scene."""
-        self.close()
+    scene_path: Path
+    depth_scale: float = 0.1
+    image_format: str = "png"
+    jpeg_quality: int = 95
 
-    @property
-    def im_ids(self) -> list[int]:
-        """Frames that are complete on disk."""
-        return sorted(self._entries["scene_gt.json"])
+    def __post_init__(self) -> None:
+        if self.image_format not in ("png", "jpg"):
+            raise DatasetError(f"image format: found '{self.image_format}', expected png or jpg")
 
-    def add_frame(
+    def write(
         self,
         im_id: int,
         rgb: UInt8[Array, "h w 3"],
@@ -85,8 +70,9 @@ class BopWriter:
         masks_visib: Sequence[Bool[Array, "vh vw"]],
         *,
         mask_origin_px: tuple[int, int] = (0, 0),
-    ) -> None:
-        """Write one frame; it counts once this returns.
+        T_cam_world: Float[Array, "4 4"] | None = None,
+    ) -> FrameEntry:
+        """Write colour, depth and masks of one frame; the frame counts once its entry is committed.
 
         Args:
             im_id: image number.
@@ -98,6 +84,8 @@ class BopWriter:
                 that boxes and pixel counts cover parts outside of it.
             masks_visib: visible part of each silhouette.
             mask_origin_px: column and row in `masks` where the image's top left pixel lies.
+            T_cam_world: pose of the world that the frames of a scene share, metres, for BOP's optional `cam_R_w2c`
+                and `cam_t_w2c`.
 
         Raises:
             DatasetError: counts or sizes disagree, or a depth does not fit into 16 bits.
@@ -124,10 +112,10 @@ class BopWriter:
             self._write_mask("mask", im_id, index, inside)
             self._write_mask("mask_visib", im_id, index, visible)
             info.append(gt_info(full, inside, visible, depth_m, mask_origin_px))
-        camera_entry = {"cam_K": as_list(camera.K), "depth_scale": self.depth_scale}
-        self._commit(im_id, [info, camera_entry, [_gt_entry(gt) for gt in gts]])
-        if not (self.root / "camera.json").exists():
-            write_camera(self.root, camera, self.depth_scale)
+        entry: dict[str, Any] = {"cam_K": as_list(camera.K), "depth_scale": self.depth_scale}
+        if T_cam_world is not None:
+            entry |= {"cam_R_w2c": as_list(T_cam_world[:3, :3]), "cam_t_w2c": as_list(T_cam_world[:3, 3] / MM)}
+        return FrameEntry(info=info, camera=entry, gt=[_gt_entry(gt) for gt in gts])
 
     def _write_images(
         self, im_id: int, rgb: UInt8[Array, "h w 3"], depth_m: Float[Array, "h w"] | None, where: str
@@ -145,16 +133,158 @@ class BopWriter:
     def _write_mask(self, folder: str, im_id: int, index: int, mask: Bool[Array, "h w"]) -> None:
         write_image(self.scene_path / folder / f"{im_id:06d}_{index:06d}.png", mask.astype(np.uint8) * 255)
 
-    def _commit(self, im_id: int, entries: Sequence[Any]) -> None:
-        for name, entry in zip(SCENE_FILES, entries, strict=True):
-            lines = self._entries[name]
-            lines[im_id] = json.dumps(entry)
-            body = ",\n".join(f'  "{key}": {lines[key]}' for key in sorted(lines))
-            write_atomic(self.scene_path / name, f"{{\n{body}\n}}\n".encode())
+
+class BopWriter:
+    """Writes one scene. A scene that exists already is continued; a frame that exists is replaced.
+
+    Frames are noted in a journal beside the images, one line each, and the scene's JSON files are made from it when
+    the writer is closed: writing them anew for each frame would cost the square of their number. A journal that a
+    killed process leaves behind is taken up by the next writer, but for a last line that was cut off.
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        split: str,
+        scene_id: int,
+        *,
+        depth_scale: float = 0.1,
+        image_format: str = "png",
+        jpeg_quality: int = 95,
+    ) -> None:
+        """Open a scene for writing.
+
+        Args:
+            root: dataset folder.
+            split: split folder's name.
+            scene_id: number of the scene folder.
+            depth_scale: millimetres for one step of the 16-bit depth image.
+            image_format: png or jpg.
+            jpeg_quality: 1 to 100, for jpg.
+
+        Raises:
+            DatasetError: another image format, or the scene's JSON files are broken.
+        """
+        self.root = Path(root)
+        self.files = FrameFiles(
+            scene_path=scene_folder(root, split, scene_id),
+            depth_scale=depth_scale,
+            image_format=image_format,
+            jpeg_quality=jpeg_quality,
+        )
+        self.scene_path = self.files.scene_path
+        self._journal = self.scene_path / JOURNAL
+        self._entries: dict[int, tuple[str, ...]] = self._finished() | self._noted()
+        self._is_closed = False
+
+    def _finished(self) -> dict[int, tuple[str, ...]]:
+        files = [self.scene_path / name for name in SCENE_FILES]
+        if not files[-1].is_file():  # the last one written: without it none of the frames counts
+            return {}
+        contents = [integer_keys(read_json(file), file) for file in files]
+        complete = set(contents[0]).intersection(*contents[1:])
+        return {im_id: tuple(json.dumps(content[im_id]) for content in contents) for im_id in complete}
+
+    def _noted(self) -> dict[int, tuple[str, ...]]:
+        """The journal's frames; what follows its last whole line is cut off."""
+        try:
+            data = self._journal.read_bytes() if self._journal.is_file() else b""
+            whole = data[: data.rfind(b"\n") + 1]
+            if len(whole) < len(data):
+                os.truncate(self._journal, len(whole))
+        except OSError as error:
+            raise storage_error(self._journal, error) from error
+        noted: dict[int, tuple[str, ...]] = {}
+        for number, line in enumerate(whole.splitlines(), 1):
+            try:
+                im_id, *entries = json.loads(line)
+            except ValueError as error:
+                raise DatasetError(f"{self._journal}:{number}: not JSON; delete it and start again") from error
+            noted[int(im_id)] = tuple(json.dumps(entry) for entry in entries)
+        return noted
+
+    def __enter__(self) -> "BopWriter":
+        """Use the writer in a with statement."""
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        """Close the scene, also after an error: its frames up to there count."""
+        self.close()
+
+    @property
+    def im_ids(self) -> list[int]:
+        """Frames that are complete on disk."""
+        return sorted(self._entries)
+
+    def add_frame(
+        self,
+        im_id: int,
+        rgb: UInt8[Array, "h w 3"],
+        depth_m: Float[Array, "dh dw"] | None,
+        camera: Camera,
+        gts: Sequence[GroundTruth],
+        masks: Sequence[Bool[Array, "mh mw"]],
+        masks_visib: Sequence[Bool[Array, "vh vw"]],
+        *,
+        mask_origin_px: tuple[int, int] = (0, 0),
+        T_cam_world: Float[Array, "4 4"] | None = None,
+    ) -> None:
+        """Write one frame; it survives the process once this returns. See `FrameFiles.write`."""
+        entry = self.files.write(
+            im_id,
+            rgb,
+            depth_m,
+            camera,
+            gts,
+            masks,
+            masks_visib,
+            mask_origin_px=mask_origin_px,
+            T_cam_world=T_cam_world,
+        )
+        self.commit(im_id, entry)
+        if not (self.root / "camera.json").exists():
+            write_camera(self.root, camera, self.files.depth_scale)
+
+    def commit(self, im_id: int, entry: FrameEntry) -> None:
+        """Note a frame whose files are written.
+
+        Raises:
+            DatasetError: the writer is closed.
+            StorageError: the journal cannot be written.
+        """
+        if self._is_closed:
+            raise DatasetError(f"{self.scene_path}, image {im_id}: the scene is closed; open it with another writer")
+        entries = (entry.info, entry.camera, entry.gt)
+        line = json.dumps([im_id, *entries]) + "\n"
+        try:
+            self._journal.parent.mkdir(parents=True, exist_ok=True)
+            with self._journal.open("ab") as stream:
+                stream.write(line.encode())
+                stream.flush()
+                os.fsync(stream.fileno())
+        except OSError as error:
+            raise storage_error(self._journal, error, len(line)) from error
+        self._entries[im_id] = tuple(json.dumps(e) for e in entries)
 
     def close(self) -> None:
-        """End the scene. Every frame is on disk already: this only makes a second `add_frame` impossible."""
-        self._entries = {}
+        """Write the scene's JSON files and remove the journal. Closing twice does nothing."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        if not self._journal.is_file():
+            return
+        for number, name in enumerate(SCENE_FILES):
+            body = ",\n".join(f'  "{im_id}": {self._entries[im_id][number]}' for im_id in sorted(self._entries))
+            write_atomic(self.scene_path / name, f"{{\n{body}\n}}\n".encode())
+        try:
+            self._journal.unlink()
+        except OSError as error:
+            raise storage_error(self._journal, error) from error
+
+
+def scene_folder(root: str | Path, split: str, scene_id: int) -> Path:
+    """Folder of a scene."""
+    return Path(root) / split / f"{scene_id:06d}"
 
 
 def gt_info(
@@ -214,9 +344,41 @@ def write_models(root: str | Path, meshes: Mapping[int, Mesh], infos: Mapping[in
 
 
 def write_targets(root: str | Path, split: str, targets: Iterable[Target]) -> None:
-    """Write the split's targets in BOP19's format."""
+    """Write the split's targets in BOP19's format (objects and how often) and BOP24's (images only)."""
+    ordered = sorted(targets)
     content = [
         {"im_id": target.im_id, "inst_count": target.inst_count, "obj_id": target.obj_id, "scene_id": target.scene_id}
-        for target in sorted(targets)
+        for target in ordered
     ]
     write_json(Path(root) / f"{split}_targets_bop19.json", content)
+    images = sorted({(target.scene_id, target.im_id) for target in ordered})
+    write_json(
+        Path(root) / f"{split}_targets_bop24.json",
+        [{"im_id": im_id, "scene_id": scene_id} for scene_id, im_id in images],
+    )
+
+
+def visible_targets(root: str | Path, split: str, scene_id: int, min_visible: float = 0.1) -> list[Target]:
+    """What is to be found in a scene: each object of an image with how many instances are visible enough.
+
+    The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible share of 0.1, and an
+    object without one is no target.
+
+    Args:
+        root: dataset folder.
+        split: split folder's name.
+        scene_id: a finished scene.
+        min_visible: smallest visible share.
+    """
+    folder = scene_folder(root, split, scene_id)
+    truth, info = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
+    targets = []
+    for im_id, gts in truth.items():
+        seen = Counter(
+            gt["obj_id"] for gt, about in zip(gts, info[im_id], strict=True) if about["visib_fract"] >= min_visible
+        )
+        targets += [
+            Target(scene_id=scene_id, im_id=int(im_id), obj_id=obj_id, inst_count=count)
+            for obj_id, count in seen.items()
+        ]
+    return sorted(targets)

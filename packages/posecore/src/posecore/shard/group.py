@@ -1,0 +1,141 @@
+"""The group's own files: the data card, the arrays' metadata and the manifest."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from posecore.errors import ShardError
+from posecore.shard import files
+from posecore.shard.fields import Field, field_table, schema
+from posecore.store import Store
+
+MANIFEST = "manifest.jsonl"
+GROUP = "zarr.json"
+
+
+def n_shards(card: Mapping[str, Any]) -> int:
+    """Shards in the complete dataset."""
+    return -(-int(card["n"]) // int(card["shard_size"]))
+
+
+def samples_in(card: Mapping[str, Any], shard_id: int) -> int:
+    """Samples in a shard: the last one may be shorter."""
+    return min(int(card["shard_size"]), int(card["n"]) - shard_id * int(card["shard_size"]))
+
+
+def shard_key(field: Field, shard_id: int) -> str:
+    """Where a field's file of a shard lies."""
+    return "/".join([field.name, "c", str(shard_id), *["0"] * len(field.shape)])
+
+
+def chunk_shape(field: Field, card: Mapping[str, Any]) -> tuple[int, ...]:
+    """Shape of a field's inner chunks, samples in front."""
+    size = field.size(card["patch_px"], card["contour_points"])
+    return (files.chunk_samples(field.shape, int(card["shard_size"])), *size)
+
+
+def metadata(card: Mapping[str, Any]) -> dict[str, bytes]:
+    """Metadata of the Zarr v3 group and its arrays, by key."""
+    group = {"zarr_format": 3, "node_type": "group", "attributes": dict(card)}
+    return {
+        **{f"{field.name}/{GROUP}": _json(_array_metadata(field, card)) for field in field_table()},
+        GROUP: _json(group),
+    }
+
+
+def _array_metadata(field: Field, card: Mapping[str, Any]) -> dict[str, Any]:
+    chunk = chunk_shape(field, card)
+    sharding = {
+        "chunk_shape": list(chunk),
+        "codecs": files.codecs(field.codec, field.dtype, len(chunk)),
+        "index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}],
+        "index_location": "end",
+    }
+    grid = {"chunk_shape": [int(card["shard_size"]), *chunk[1:]]}
+    return {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": [int(card["n"]), *chunk[1:]],
+        "data_type": field.dtype,
+        "chunk_grid": {"name": "regular", "configuration": grid},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": 0.0 if field.dtype.startswith("float") else 0,
+        "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
+        "dimension_names": ["sample", *[s if isinstance(s, str) else f"axis{i}" for i, s in enumerate(field.shape)]],
+        "attributes": {
+            "unit": field.unit,
+            "scale": field.step(card),
+            "squared": field.squared,
+            "text": field.text,
+        },
+        "storage_transformers": [],
+    }
+
+
+def _json(content: Mapping[str, Any]) -> bytes:
+    return json.dumps(content, indent=2).encode()
+
+
+def read_card(url: str, group: bytes) -> dict[str, Any]:
+    """The data card of a group's metadata.
+
+    Raises:
+        ShardError: It is none, or of another schema.
+    """
+    try:
+        card = dict(json.loads(group)["attributes"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ShardError(
+            f"{url}/{GROUP}: not the metadata of a Zarr v3 group; the dataset is damaged, delete it and render it again"
+        ) from error
+    name, version = schema()
+    found = (card.get("schema"), card.get("schema_version"))
+    if found != (name, version):
+        raise ShardError(
+            f"{url}: schema {found[0]} version {found[1]}, expected {name} version {version}; "
+            "render the dataset again with this version, or use the version that made it"
+        )
+    return card
+
+
+def read_manifest(url: str, store: Store) -> list[dict[str, Any]]:
+    """The manifest's lines in their order. See `parse_manifest`."""
+    return parse_manifest(url, store.get(MANIFEST) or b"")
+
+
+def parse_manifest(url: str, data: bytes) -> list[dict[str, Any]]:
+    """The lines of a manifest's content.
+
+    Raises:
+        ShardError: One is broken.
+    """
+    lines = []
+    for number, text in enumerate(data.decode("utf-8", "replace").splitlines(), start=1):
+        try:
+            line = json.loads(text)
+            lines.append({**line, "shard": int(line["shard"]), "bytes": dict(line["bytes"])})
+        except (ValueError, KeyError, TypeError) as error:
+            raise ShardError(
+                f"{url}/{MANIFEST}, line {number}: not a shard's JSON record; delete the line and render again"
+            ) from error
+    return lines
+
+
+def check_same_card(url: str, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise the first difference between two cards as a ShardError."""
+    difference = _first_difference(found, wanted, "")
+    if difference:
+        raise ShardError(
+            f"{url}: holds another dataset ({difference}); choose another --out, or delete that folder, "
+            "or start with the same settings to resume"
+        )
+
+
+def _first_difference(found: Any, wanted: Any, path: str) -> str | None:
+    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
+        for key in sorted({*found, *wanted}):
+            difference = _first_difference(found.get(key), wanted.get(key), f"{path}.{key}" if path else key)
+            if difference:
+                return difference
+        return None
+    return None if found == wanted else f"{path} is {found!r} there and {wanted!r} here"

@@ -1,0 +1,137 @@
+"""Reading: shards of a dataset, complete or still growing, as arrays in physical units."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from posecore.errors import ShardError
+from posecore.shard import files
+from posecore.shard.fields import Field, field_table
+from posecore.shard.group import GROUP, MANIFEST, chunk_shape, n_shards, read_card, read_manifest, samples_in, shard_key
+from posecore.shard.memory import Recycler
+from posecore.store import open_store
+
+Array = np.ndarray
+
+
+class ShardReader:
+    """Reads a dataset, complete or still growing.
+
+    Raises:
+        ShardError: Not a dataset, of another schema, or with a broken manifest.
+        StorageError: The place cannot be reached or read.
+    """
+
+    def __init__(self, url: str) -> None:
+        self.url = str(url)
+        self._store = open_store(self.url)
+        group = self._store.get(GROUP)
+        if group is None:
+            raise ShardError(
+                f"{self.url}: no {GROUP} here, so this is no shard dataset; make one with `synthgen render`"
+            )
+        self.card = read_card(self.url, group)
+        self._memory = Recycler()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Read the manifest again: a dataset may grow while it is read."""
+        self._lines = {line["shard"]: line for line in read_manifest(self.url, self._store)}
+
+    @property
+    def n(self) -> int:
+        """Samples in the complete dataset."""
+        return int(self.card["n"])
+
+    @property
+    def shard_size(self) -> int:
+        """Samples in every shard but the last."""
+        return int(self.card["shard_size"])
+
+    @property
+    def committed(self) -> list[int]:
+        """Ids of the shards that are there, sorted."""
+        return sorted(self._lines)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every shard is there."""
+        return len(self._lines) == n_shards(self.card)
+
+    def n_samples(self, shard_id: int) -> int:
+        """Samples in a shard."""
+        return samples_in(self.card, shard_id)
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of the card and the manifest: names the dataset's content."""
+        lines = json.dumps([self._lines[i] for i in sorted(self._lines)], sort_keys=True)
+        return hashlib.sha256((json.dumps(self.card, sort_keys=True) + lines).encode()).hexdigest()
+
+    def file(self, key: str) -> bytes:
+        """Bytes of a further file of the dataset, such as `models/models_info.json`.
+
+        Raises:
+            ShardError: It is missing.
+        """
+        data = self._store.get(key)
+        if data is None:
+            raise ShardError(f"{self.url}/{key}: missing from the dataset; render it again")
+        return data
+
+    def read(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, Array]:
+        """Decode a whole shard, or some of its fields, into physical units.
+
+        Every chunk is held against its CRC-32C.
+
+        Raises:
+            ShardError: Not committed, or a file is missing, of another length, or does not decode; when the whole shard
+                is read, also if its SHA-256 differs.
+        """
+        if shard_id not in self._lines:
+            raise ShardError(f"{self.url}: shard {shard_id} is not in {MANIFEST}; there are {len(self._lines)} shards")
+        table = {field.name: field for field in field_table()}
+        line = self._lines[shard_id]
+        digest = hashlib.sha256()
+        values = {}
+        for name in table if fields is None else fields:
+            data = self._field_bytes(table[name], shard_id, line)
+            if fields is None:
+                digest.update(data)
+            values[name] = self._decode(table[name], shard_id, data)
+        if fields is None and digest.hexdigest() != line.get("sha256"):
+            raise ShardError(
+                f"{self.url}: shard {shard_id} differs from its checksum in {MANIFEST}; the shard is damaged: "
+                "delete its line and run the same `synthgen render` again"
+            )
+        return values
+
+    def _field_bytes(self, field: Field, shard_id: int, line: Mapping[str, Any]) -> bytes:
+        key = shard_key(field, shard_id)
+        data, expected = self._store.get(key), line["bytes"].get(field.name)
+        if data is None or len(data) != expected:
+            found = "no file" if data is None else f"{len(data)} bytes"
+            raise self._damaged(shard_id, f"{key}: found {found}, expected {expected} bytes")
+        return data
+
+    def _decode(self, field: Field, shard_id: int, data: bytes) -> Array:
+        chunk, *size = chunk_shape(field, self.card)
+        values = self._memory.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
+        for first in range(0, len(values), chunk):
+            try:
+                stored = files.unpack(data, field.codec, field.dtype, (chunk, *size), self.shard_size, first)
+            except (ValueError, RuntimeError) as error:
+                what = f"{shard_key(field, shard_id)}: does not decode ({error})"
+                raise self._damaged(shard_id, what) from error
+            field.decode(stored[: len(values) - first], self.card, values[first : first + chunk])
+        return values
+
+    def _damaged(self, shard_id: int, what: str) -> ShardError:
+        return ShardError(
+            f"{self.url}/{what}; the shard is damaged: delete its line (shard {shard_id}) from {MANIFEST} and run the "
+            "same `synthgen render` again"
+        )
