@@ -47,14 +47,15 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         if not wanted:
             continue
         samples = reader.read(shard_id)
-        rows += [_row({k: v[i - start] for k, v in samples.items()}, i) for i in wanted]
+        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in wanted]
     if not rows:
         rendered = sum(map(reader.n_samples, reader.committed))
         raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
-    return np.concatenate([_titles(), *rows])
+    return np.concatenate([title_row(), *rows])
 
 
-def _row(sample: Mapping[str, Array], index: int) -> Image:
+def sample_row(sample: Mapping[str, Array], index: int) -> Image:
+    """One row of a contact sheet from the fields of one sample."""
     K = sample["K_crop"]
     scale = CELL_PX / sample["scene_rgb"].shape[0]
     uv_scene = project(K, sample["scene_contour_cam_m"].astype(np.float64)) * scale
@@ -111,7 +112,8 @@ def _mask_colours(mask: UInt8[Array, "h w"]) -> Image:
     return image
 
 
-def _titles() -> Image:
+def title_row() -> Image:
+    """The headings above the rows of a contact sheet."""
     return _strip(_TITLES, len(_TITLES))
 
 

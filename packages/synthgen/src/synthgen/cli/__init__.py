@@ -3,9 +3,13 @@
 import click
 
 from synthgen.cli.bop import bop
+from synthgen.cli.doctor import doctor
+from synthgen.cli.export import export
 from synthgen.cli.group import CleanGroup
+from synthgen.cli.info import info
 from synthgen.cli.preview import preview
 from synthgen.cli.render import render
+from synthgen.cli.verify import verify
 
 _CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
 
@@ -17,10 +21,12 @@ def main() -> None:
 
     \b
     synthgen render --object mesh.ply --n 20000 --out shards
+    synthgen doctor
+    synthgen verify shards --report verify.html
     synthgen preview shards --out sheet.png
     synthgen bop --object mesh.ply --frames 50 --out test_bop
     """
 
 
-for _command in (render, bop, preview):
+for _command in (bop, doctor, export, info, preview, render, verify):
     main.add_command(_command)

@@ -1,51 +1,107 @@
 """`synthgen bop`."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from synthgen.cli.console import progress_bar, start_logging, stoppable
-from synthgen.cli.options import load_meshes, load_photos, scene_options, text
+from synthgen.cli.options import scene_options
 
 if TYPE_CHECKING:
-    from posecore.mesh import Units
+    from synthgen.framemaker import Split
+    from synthgen.sources import Sources
 
 
 @click.command()
 @scene_options
-@click.option("--frames", required=True, type=click.IntRange(1), help="Number of images.")
+@click.option("--frames", required=True, type=click.IntRange(1), help="Number of images; of each sequence.")
+@click.option(
+    "--objects-per-frame",
+    nargs=2,
+    type=click.IntRange(1),
+    metavar="LO HI",
+    help="Range of the number of labelled objects in an image. [preset, 1 1]",
+)
+@click.option(
+    "--frames-per-scene",
+    type=click.IntRange(1),
+    help="Images from as many cameras that share what stands there: a BOP scene each, 000000 on. [every image has a "
+    "layout of its own, all in scene 000001]",
+)
+@click.option(
+    "--split",
+    type=click.Choice(["test", "val", "train_pbr"]),
+    default="test",
+    show_default=True,
+    help="BOP split. train_pbr has JPEG images and no targets file, as BOP's own. Splits never share a scene.",
+)
+@click.option("--sequence", is_flag=True, help="Smooth tracking sequences instead of single images.")
+@click.option("--sequences", type=click.IntRange(1), help="Number of sequences, scenes 000001 on. [1 with --sequence]")
+@click.option("--fps", type=click.FloatRange(0.1), help="Images a second of sequences. [preset, 30]")
+@click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes that render.")
 def bop(
-    objects: tuple[Path, ...],
+    sources: "Sources",
     out: str,
     frames: int,
-    units: "Units",
+    objects_per_frame: tuple[int, int] | None,
+    frames_per_scene: int | None,
+    split: "Split",
+    sequence: bool,
+    sequences: int | None,
+    fps: float | None,
+    workers: int,
     preset: str,
     overrides: tuple[str, ...],
-    backgrounds: Path | None,
-    models_info: Path | None,
     quiet: bool,
     verbose: bool,
     **values: Any,
 ) -> None:
-    """Render whole camera images with ground truth as a BOP dataset (split `test`, scene 1).
+    """Render whole camera images, or tracking sequences, with ground truth as a BOP dataset.
 
-    The images follow the same preset as training pairs, but are other scenes.
+    The images follow the same preset as training pairs, but are other scenes. Stopping it at any moment, also with kill
+    -9, loses only the images in flight; the same command again continues and ends with the same bytes, with any number
+    of workers.
 
     \b
     synthgen bop --object mesh.ply --frames 50 --out test_bop
     synthgen bop --object mesh.ply --frames 20 --out test_bop --preset quickstart --engine raster --seed 7
+    synthgen bop --object models/ --frames 200 --objects-per-frame 3 8 --out test_bop --workers 4
+    synthgen bop --object models/ --frames 5000 --frames-per-scene 25 --split train_pbr --preset pbr --out pbr
+    synthgen bop --object mesh.ply --sequence --frames 300 --sequences 4 --fps 30 --out tracks
     """
-    from synthgen import bopset, dataset
+    from posecore.errors import ConfigError
+
+    from synthgen import bopset
     from synthgen.config import load_config
+    from synthgen.framemaker import FramePlan
 
     start_logging(verbose)
+    if not sequence and (sequences is not None or fps is not None):
+        raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: only sequences have it; add --sequence")
+    if objects_per_frame is not None:
+        overrides = (*overrides, f"frames.objects=[{objects_per_frame[0]}, {objects_per_frame[1]}]")
+    if fps is not None:
+        overrides = (*overrides, f"sequence.fps={fps}")
     config = load_config(preset, overrides, values)
-    meshes, photos = load_meshes(objects, units), load_photos(backgrounds)
-    infos = dataset.load_symmetries(text(models_info), meshes)
+    plan = FramePlan(
+        split=split,
+        frames=frames,
+        frames_per_scene=frames_per_scene,
+        sequences=(sequences or 1) if sequence else None,
+    )
+    meshes, assets = sources.meshes(), sources.assets()
+    infos = sources.infos(meshes)
+    total = sum(count for _, count in plan.scenes())
     with stoppable(out), progress_bar(quiet) as bar:
-        task = bar.add_task("frames", total=frames)
+        task = bar.add_task("frames", total=total)
         bopset.write_dataset(
-            out, config, meshes, frames, photos=photos, infos=infos, on_frame=lambda _: bar.advance(task)
+            out,
+            config,
+            meshes,
+            plan,
+            assets=assets,
+            infos=infos,
+            workers=workers,
+            on_frame=lambda scene_id, im_id: bar.advance(task),
         )
-    click.echo(f"{out}: complete, {frames} frames", err=True)
+    click.echo(f"{out}: complete, {total} frames", err=True)

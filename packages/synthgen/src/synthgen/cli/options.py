@@ -1,21 +1,38 @@
-"""Options that decide what scenes look like, shared by `render` and `bop`, and what they name, loaded."""
+"""Options that decide what scenes look like, shared by `render` and `bop`."""
 
+import functools
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
-
-if TYPE_CHECKING:
-    from posecore.mesh import Mesh, Units
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 ENGINES = ("cycles", "eevee", "raster")
 
 
+_SOURCES = (
+    "objects",
+    "units",
+    "backgrounds",
+    "hdris",
+    "occluders",
+    "models_info",
+    "allow_missing_textures",
+    "skip_bad_objects",
+)
+
+
 def scene_options(command: F) -> F:
-    """Options that decide what scenes look like, shared by `render` and `bop`."""
+    """Options that decide what scenes look like; those that name files reach the command as one `sources` argument."""
+
+    @functools.wraps(command)
+    def with_sources(**values: Any) -> Any:
+        from synthgen.sources import Sources
+
+        return command(sources=Sources(**{name: values.pop(name) for name in _SOURCES}), **values)
+
     options = [
         click.option(
             "--object",
@@ -23,9 +40,10 @@ def scene_options(command: F) -> F:
             required=True,
             multiple=True,
             type=click.Path(path_type=Path),
-            metavar="MESH",
-            help="Mesh of the object (.ply, .obj, .gltf, .glb, .stl). Repeat it for several objects: each scene "
-            "shows one of them. Files named obj_000005.ply keep their number.",
+            metavar="MESH|DIR",
+            help="Mesh of the object (.ply, .obj, .gltf, .glb, .stl), a folder of meshes, or a BOP models folder. "
+            "Repeat it for several objects: each scene shows one of them, all equally often. Files named "
+            "obj_000005.ply keep their number.",
         ),
         click.option(
             "--out", required=True, type=str, metavar="DIR", help="Where to. The same command again continues it."
@@ -40,7 +58,7 @@ def scene_options(command: F) -> F:
             "--preset",
             default="default",
             metavar="NAME|FILE",
-            help="Shipped preset (default, quickstart) or YAML file.",
+            help="Shipped preset (category, choi, default, linemod, pbr, quickstart, tabletop, tejani) or YAML file.",
         ),
         click.option(
             "--set",
@@ -55,39 +73,39 @@ def scene_options(command: F) -> F:
             "--backgrounds",
             type=click.Path(path_type=Path),
             metavar="DIR",
-            help="Folder of photographs to put behind; without it backgrounds are drawn.",
+            help="Folder of photographs to put behind and on tables; without it backgrounds are drawn.",
+        ),
+        click.option(
+            "--hdris",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Folder of panoramas (.hdr, .exr) to light scenes with; without it there are lamps only.",
+        ),
+        click.option(
+            "--occluders",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            help="Folder of meshes that hide the object and lie around it, in --units; without it primitive shapes.",
         ),
         click.option(
             "--models-info",
             type=click.Path(path_type=Path),
             metavar="FILE",
-            help="BOP models_info.json to take symmetries from; its keys are object ids or mesh names.",
+            help="BOP models_info.json to take symmetries from; its keys are object ids or mesh names. [that of a BOP "
+            "models folder]",
+        ),
+        click.option(
+            "--allow-missing-textures",
+            is_flag=True,
+            help="Give a mesh whose texture is missing its plain colours instead of stopping.",
+        ),
+        click.option(
+            "--skip-bad-objects", is_flag=True, help="Leave out objects that cannot be loaded, with a line for each."
         ),
         click.option("--quiet", is_flag=True, help="No progress bar."),
         click.option("--verbose", is_flag=True, help="Log details to stderr."),
     ]
+    wrapped: Any = with_sources
     for option in reversed(options):
-        command = option(command)
-    return command
-
-
-def load_meshes(objects: tuple[Path, ...], units: "Units") -> "dict[int, Mesh]":
-    """The objects by id."""
-    from posecore.mesh import load_mesh
-
-    from synthgen.target import object_ids
-
-    ids = object_ids([str(p) for p in objects])
-    return {obj_id: load_mesh(path, units=units) for obj_id, path in zip(ids, objects, strict=True)}
-
-
-def load_photos(folder: Path | None) -> tuple[str, ...]:
-    """Photographs of the backgrounds folder, none without one."""
-    from synthgen.background import list_photos
-
-    return list_photos(folder.resolve()) if folder is not None else ()
-
-
-def text(path: Path | None) -> str | None:
-    """A path as text."""
-    return None if path is None else str(path)
+        wrapped = option(wrapped)
+    return wrapped

@@ -1,0 +1,107 @@
+"""Where a dataset's samples lie: the numbers behind the histograms."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from synthgen.verify.checks import centres_cam_m, moved_diameters, perturbation_deg
+from synthgen.verify.facts import Batch, Facts
+
+Array = np.ndarray
+Coverage = Mapping[str, Array]
+"""Numbers by name, one row a sample."""
+
+
+def coverage_of(batch: Batch) -> dict[str, Array]:
+    """What the histograms show of each sample.
+
+    Returns:
+        view: (n, 3) unit vector from the object's box centre to the camera, object frame.
+        roll_deg: Turn of the object in the image plane, of its z axis (x where the camera looks along z).
+        distance_m: Camera z of the box centre.
+        distance_diameters: The same in diameters.
+        angle_deg, moved_diameters: Distance of the hypothesis.
+        visible_fraction: As stored.
+        u, v: Window centre as a share of the image.
+        scene, obj_id, rejected: As stored.
+    """
+    T, centre = batch["T_cam_obj"], centres_cam_m(batch, "T_cam_obj")
+    R = T[:, :3, :3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        view = -np.einsum("nji,nj->ni", R, centre)
+        view /= np.linalg.norm(view, axis=1, keepdims=True)
+    axis = np.where(np.abs(view[:, 2:]) < 0.99, R[:, :, 2], R[:, :, 0])
+    x0, y0, side = batch["window_px"].T
+    return {
+        "view": view,
+        "roll_deg": np.rad2deg(np.arctan2(axis[:, 0], -axis[:, 1])),
+        "distance_m": centre[:, 2],
+        "distance_diameters": centre[:, 2] / batch.facts.of_objects(batch["obj_id"], "diameter_m"),
+        "angle_deg": perturbation_deg(batch),
+        "moved_diameters": moved_diameters(batch),
+        "visible_fraction": batch["visible_fraction"].astype(np.float64),
+        "u": (x0 + side / 2) / batch.facts.camera.width_px,
+        "v": (y0 + side / 2) / batch.facts.camera.height_px,
+        "scene": batch["scene_index"].astype(np.int64),
+        "obj_id": batch["obj_id"].astype(np.int64),
+        "rejected": batch["rejected"].astype(np.int64),
+    }
+
+
+def joined(parts: Sequence[Coverage]) -> dict[str, Array]:
+    """Rows of several shards after one another."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
+
+
+def scenes_of(coverage: Coverage) -> dict[str, Array]:
+    """The first sample of each scene: what belongs to the truth counts once a scene."""
+    _, first = np.unique(coverage["scene"], return_index=True)
+    return {name: values[first] for name, values in coverage.items()}
+
+
+def lambert_xy(direction: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+    """Lambert's azimuthal equal-area map of unit directions, each hemisphere around its own pole.
+
+    The pole (z = +1 or -1) is at (0, 0), the equator at radius 1; equal areas on the sphere stay equal. Azimuth runs
+    counter-clockwise from +x for both hemispheres. Source: Snyder, Map Projections - A Working Manual, 24.
+    """
+    radius = np.sqrt((1.0 - np.abs(direction[:, 2])).clip(0.0))
+    azimuth = np.arctan2(direction[:, 1], direction[:, 0])
+    return np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)], axis=-1)
+
+
+def sectors_in(ring: Any) -> Any:
+    """Cells of a ring of the map: with as many, all cells of all rings have the same area and are nearly square."""
+    return 3 * (2 * ring + 1)
+
+
+def view_counts(view: Float[Array, "n 3"], rings: int) -> tuple[Int[Array, " c"], Int[Array, " c"]]:
+    """Directions in each cell of the two hemispheres' maps, (upper, lower).
+
+    Ring k lies between the radii k / rings and (k + 1) / rings and is cut into `sectors_in(k)` cells from +x on,
+    counter-clockwise. A map has 3 rings^2 cells of equal area, from the pole outwards.
+    """
+    finite = view[np.isfinite(view).all(axis=1)]
+    xy = lambert_xy(finite)
+    ring = np.minimum((np.linalg.norm(xy, axis=1) * rings).astype(int), rings - 1)
+    turn = np.arctan2(xy[:, 1], xy[:, 0]) / (2 * np.pi) % 1.0
+    sectors = sectors_in(ring)
+    cell = 3 * ring**2 + np.minimum((turn * sectors).astype(int), sectors - 1)
+    upper = finite[:, 2] >= 0
+    return (
+        np.bincount(cell[upper], minlength=3 * rings**2),
+        np.bincount(cell[~upper], minlength=3 * rings**2),
+    )
+
+
+def summary(coverage: Coverage, facts: Facts) -> dict[str, object]:
+    """Coverage in a few numbers, for JSON: quantiles 0, 0.25, 0.5, 0.75, 1, and samples by object."""
+    result: dict[str, object] = {}
+    for name in ("distance_m", "distance_diameters", "angle_deg", "moved_diameters", "visible_fraction", "rejected"):
+        finite = coverage[name][np.isfinite(coverage[name])] if coverage else np.zeros(0)
+        result[name] = np.quantile(finite, [0, 0.25, 0.5, 0.75, 1]).tolist() if len(finite) else None
+    counts = coverage["obj_id"] if coverage else np.zeros(0, np.int64)
+    result["samples_by_object"] = {str(i): int((counts == i).sum()) for i in sorted(facts.meshes)}
+    return result
