@@ -18,6 +18,7 @@ PACKAGES = ("posecore", "synthgen", "refinenet", "evalkit")
 PROGRAMS = ("synthgen", "refinenet", "evalkit")
 DISTRIBUTIONS = {  # module -> the name it is installed under, where the two differ
     "cv2": "opencv-python-headless",
+    "google_crc32c": "google-crc32c",
     "huggingface_hub": "huggingface-hub",
     "mathutils": "bpy",
     "PIL": "pillow",
@@ -28,6 +29,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
     "dask",  # distributed needs one of its own age
     "pillow",  # trimesh reads textures with it
     "tensorboard",  # torch.utils.tensorboard writes with it
+    "s3fs",  # fsspec opens s3:// with it
+    "zarr",  # what others open a dataset with; tests hold our shard files against it
 }
 TEST_TIME_ORACLES = {"timm"}
 

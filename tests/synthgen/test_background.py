@@ -51,7 +51,18 @@ def test_missing_and_empty_folders_are_named(tmp_path):
 
 
 def test_a_broken_photograph_is_named(tmp_path):
+    import cv2
+
+    cv2.imwrite(str(tmp_path / "good.png"), np.zeros((9, 9, 3), np.uint8))
     (tmp_path / "broken.jpg").write_bytes(b"not a picture")
-    (path,) = background.list_photos(tmp_path)
+    with pytest.raises(ConfigError, match=r"broken\.jpg: not a picture; repair it or take it out"):
+        background.list_photos(tmp_path)
     with pytest.raises(ConfigError, match=r"broken\.jpg"):
-        background.draw(Background(kind="photo", path=path), 8, 8)
+        background.draw(Background(kind="photo", path=str(tmp_path / "broken.jpg")), 8, 8)
+
+
+def test_a_folder_without_readable_photographs_is_named(tmp_path):
+    for name in ("a.jpg", "b.png"):
+        (tmp_path / name).write_bytes(b"not a picture")
+    with pytest.raises(ConfigError, match=rf"--backgrounds {tmp_path}: none of its 2 pictures is readable"):
+        background.list_photos(tmp_path)

@@ -1,11 +1,12 @@
 import pytest
+import yaml
 from posecore import config as config_tools
 from posecore.errors import ConfigError
 from synthgen.config import SynthConfig, load_config, preset_names
 
 
 def test_every_preset_resolves_and_survives_a_round_trip():
-    assert {"default", "quickstart"} <= set(preset_names())
+    assert {"default", "quickstart", "linemod", "tejani", "choi", "category", "tabletop"} <= set(preset_names())
     for name in preset_names():
         config = load_config(name)
         assert config_tools.build(SynthConfig, config_tools.to_dict(config), "again") == config
@@ -43,7 +44,7 @@ def test_a_wrong_key_or_value_is_named(overrides, named):
 
 
 def test_an_unknown_preset_lists_the_known_ones():
-    with pytest.raises(ConfigError, match="default, quickstart"):
+    with pytest.raises(ConfigError, match="category, choi, default, linemod"):
         load_config("fast")
 
 
@@ -53,3 +54,16 @@ def test_distances_follow_the_object_or_are_absolute():
     assert far == pytest.approx(0.3)
     with pytest.raises(ConfigError, match=r"distance\.min"):
         load_config("default", ["distance.unit=m", "distance.min=0.05"]).distance.range_m(0.1)
+
+
+def test_every_key_stands_in_the_documentation_with_its_default(repository):
+    page = (repository / "docs" / "scenes.md").read_text(encoding="utf-8")
+    config = config_tools.to_dict(SynthConfig())
+    groups = {name: group for name, group in config.items() if isinstance(group, dict)}
+    for name in groups.keys() - {"camera", "frames", "sequence"}:  # the last two are of whole images: docs/bop.md
+        for key, value in groups[name].items():
+            row = next((line for line in page.splitlines() if line.startswith(f"| `{name}.{key}` |")), None)
+            assert row is not None, f"{name}.{key} is not in docs/scenes.md"
+            assert yaml.safe_load(row.split("`")[3]) == value, row
+    for preset in preset_names():
+        assert f"`{preset}`" in page

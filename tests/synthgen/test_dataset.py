@@ -7,12 +7,13 @@ import pytest
 from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import Mesh
 from synthgen import dataset
+from synthgen.assets import Assets
 from synthgen.config import load_config
 from synthgen.target import object_ids
 
 
 def test_the_card_tells_everything_but_time_and_place(config_of, tug):
-    card = dataset.make_card(config_of(), 10, {1: tug}, ())
+    card = dataset.make_card(config_of(), 10, {1: tug}, Assets())
     text = json.dumps(card)
     assert platform.node() not in text
     assert str(tug.path) not in text
@@ -20,14 +21,14 @@ def test_the_card_tells_everything_but_time_and_place(config_of, tug):
     assert card["config"]["occluders"]["library"] == 8
     assert card["versions"]["posecore"]
     assert "bpy" not in card["versions"]
-    assert "bpy" in dataset.make_card(config_of("engine=cycles"), 10, {1: tug}, ())["versions"]
+    assert "bpy" in dataset.make_card(config_of("engine=cycles"), 10, {1: tug}, Assets())["versions"]
 
 
 def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"1")
-    one = dataset.make_card(config_of(), 10, {1: tug}, [str(tmp_path / "a.jpg")])["backgrounds"]
+    one = dataset.make_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
     (tmp_path / "a.jpg").write_bytes(b"2")
-    two = dataset.make_card(config_of(), 10, {1: tug}, [str(tmp_path / "a.jpg")])["backgrounds"]
+    two = dataset.make_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
     assert one["photos"] == two["photos"] == 1
     assert one["sha256"] != two["sha256"]
 
@@ -35,8 +36,8 @@ def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
 @pytest.mark.parametrize("scale", [0.25, 3.0])  # 3 cm and 36 cm
 def test_any_size_of_object_fits_the_defaults(config_of, tug, scale):
     mesh = Mesh(vertices_m=tug.vertices_m * scale, faces=tug.faces, normals=tug.normals, vertex_rgb=tug.vertex_rgb)
-    card = dataset.make_card(config_of(), 1, {1: mesh}, ())
-    plain = dataset.make_card(config_of(), 1, {1: tug}, ())
+    card = dataset.make_card(config_of(), 1, {1: mesh}, Assets())
+    plain = dataset.make_card(config_of(), 1, {1: tug}, Assets())
     side = [c["objects"]["1"]["window_side_px"] for c in (card, plain)]
     assert side[0] == pytest.approx(side[1])
 
@@ -78,6 +79,6 @@ def test_depth_of_large_objects_fits_in_coarser_steps(diameter_m, step_m):
         faces=np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
         normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
     )
-    card = dataset.make_card(load_config("default"), 8, {1: mesh}, ())
+    card = dataset.make_card(load_config("default"), 8, {1: mesh}, Assets())
     assert card["depth_step_m"] == pytest.approx(step_m)
     assert card["depth_step_m"] * 65535 > 14 * diameter_m

@@ -167,8 +167,15 @@ def test_hypothesis_patches_are_the_object_on_black(maker_of):
     assert np.array_equal(contour, s["hypothesis_distance_px"][0] == 0)
 
 
-def test_a_configuration_that_accepts_nothing_says_what_to_change(maker_of):
-    with pytest.raises(ConfigError, match=r"window\.padding"):
+def test_a_configuration_that_accepts_nothing_says_what_to_change(maker_of, monkeypatch):
+    with pytest.raises(ConfigError, match=r"tug\.ply\): all 100 draws .* lower window\.min_area_px \(is 100000\)"):
         maker_of("window.min_area_px=100000").samples(0)
-    with pytest.raises(ConfigError, match=r"occluders\.min_visible"):
+    with pytest.raises(ConfigError, match=r"100 x too much of it hidden.*lower occluders\.min_visible \(is 1\)"):
         maker_of("occluders.front=[20, 20]", "occluders.min_visible=1.0").samples(0)
+    with pytest.raises(ConfigError, match=r"outside the image.*lower view\.position_jitter \(is 0\.6\)"):
+        maker_of("view.min_inside=1.0", "camera.fx=9000", "camera.fy=9000").samples(0)
+    monkeypatch.setattr("synthgen.pair.MAX_ATTEMPTS", 5)
+    monkeypatch.setattr("synthgen.pair.MAX_HYPOTHESIS_ATTEMPTS", 2)
+    far = maker_of("perturbation.max_translation_diameter=2", "perturbation.easy_share=0", "window.padding=0")
+    with pytest.raises(ConfigError, match=r"no hypothesis.*left the window.*max_translation_diameter \(is 2\)"):
+        concatenate(far.samples(index) for index in range(20))

@@ -12,9 +12,9 @@ import numpy as np
 import psutil
 import pytest
 from distributed import Client
-from posecore.shard import Encoded, ShardReader, ShardWriter
-from synthgen import pipeline
-from synthgen.shardrun import ShardJob
+from posecore.shard import Encoded, ShardReader, ShardWriter, field_table
+from synthgen import cluster, pipeline, worker
+from synthgen.shardrun import ShardJob, ShardRenderer
 
 
 def command(tug_ply, out, small_set, *extra):
@@ -105,8 +105,8 @@ def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set)
     while not (out / "manifest.jsonl").exists() and time.monotonic() - started < 60:
         time.sleep(0.01)
     workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
-    for worker in workers:
-        worker.kill()
+    for victim in workers:
+        victim.kill()
     _, errors = process.communicate(timeout=120)
     assert workers
     assert process.returncode == 0, errors
@@ -141,29 +141,32 @@ def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, sm
     assert tree(reference) == before
 
 
-class Echo:
+class Echo(ShardRenderer):
     """Stands for a renderer: its shards say whose job they are."""
 
     def __init__(self, job):
         self.seed = job.card["seed"]
 
-    def render(self, shard_id):
+    def prepare(self):
+        pass
+
+    def render(self, shard_id, quarantined):
         line = {"shard": shard_id, "n": 2, "rejected": 0, "seed": self.seed, "bytes": {}}
-        return Encoded(shard_id=shard_id, files={}, line=line)
+        return Encoded(shard_id=shard_id, files=dict.fromkeys((f.name for f in field_table()), b""), line=line)
 
 
 def test_jobs_that_share_a_cluster_keep_their_own_recipes(tmp_path, monkeypatch, config_of):
-    monkeypatch.setattr(pipeline, "ShardRenderer", Echo)
+    monkeypatch.setattr(worker, "ShardRenderer", Echo)
     settings = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
-    with dask.config.set(pipeline._SETTINGS), Client(**settings) as client:
+    with dask.config.set(cluster.SETTINGS), Client(**settings) as client:
         sizes = {"n": 6, "shard_size": 2, "patch_px": 16, "contour_points": 5, "depth_step_m": 1e-4}
         cards = [{**sizes, "seed": seed} for seed in (1, 2)]
-        plugins = [pipeline.RendererPlugin(ShardJob(config=config_of(), card=card, meshes={})) for card in cards]
+        plugins = [worker.RendererPlugin(ShardJob(config=config_of(), card=card, meshes={})) for card in cards]
         for plugin in plugins:  # both are there before the first one's shards are asked for
             client.register_plugin(plugin)
         for card, plugin in zip(cards, plugins, strict=True):
             writer = ShardWriter.create(str(tmp_path / str(card["seed"])), card)
-            pipeline._render_all(client, plugin.name, iter(range(3)), writer, lambda encoded: None)
+            pipeline.Dispatcher(client, plugin, writer, lambda encoded: None).render(iter(range(3)))
             manifest = (tmp_path / str(card["seed"]) / "manifest.jsonl").read_text()
             assert writer.committed() == [0, 1, 2]
             assert manifest.count(f'"seed": {card["seed"]}') == 3

@@ -1,12 +1,15 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from posecore.se3 import rotation_angle_rad
 from synthgen import sampling
+from synthgen.assets import Assets
 from synthgen.streams import Purpose, Subject, stream
 
 
 def draw(config, target, index, attempt=0, purpose=Purpose.PAIRS):
-    return sampling.draw_scene(config, [target], (), purpose, index, attempt)
+    return sampling.draw_scene(config, [target], Assets(), purpose, index, attempt)
 
 
 def as_text(scene_draw):
@@ -105,3 +108,54 @@ def test_share_inside():
     assert sampling.share_inside(np.array([-10.0, 10, 10, 20]), camera) == pytest.approx(0.5)
     assert sampling.share_inside(np.array([-30.0, 10, -10, 20]), camera) == 0.0
     assert sampling.share_inside(np.array([-np.inf, -np.inf, np.inf, np.inf]), camera) == 0.0
+
+
+def test_every_prefix_of_scenes_shows_all_objects_equally_often():
+    for count in (1, 3, 7):
+        shown = [sampling.target_of(5, Purpose.PAIRS, i, count) for i in range(50)]
+        for n in range(1, 51):
+            times = np.bincount(shown[:n], minlength=count)
+            assert times.max() - times.min() <= 1
+    orders = {tuple(sampling.target_of(5, Purpose.PAIRS, 7 * b + i, 7) for i in range(7)) for b in range(10)}
+    assert len(orders) > 5
+
+
+def test_an_object_that_is_rejected_is_drawn_again(config_of, tug_target):
+    other = replace(tug_target, obj_id=2)
+    for index in range(6):
+        ids = {
+            sampling.draw_scene(config_of(), [tug_target, other], Assets(), Purpose.PAIRS, index, a).target.obj_id
+            for a in range(4)
+        }
+        assert len(ids) == 1
+
+
+def test_materials_have_their_shares(config_of, tug_target):
+    config = config_of("material.textureless_share=0.3", "material.random_colour_share=0.4", "material.hue_shift=0")
+    looks = [draw(config, tug_target, i).material for i in range(200)]
+    own = [m for m in looks if m.base_rgb is None]
+    patterned = [m for m in looks if m.pattern is not None]
+    assert len(own) / 200 == pytest.approx(0.3, abs=0.09)
+    assert len(patterned) / 200 == pytest.approx(0.2, abs=0.08)
+    rng = np.random.default_rng(0)
+    mean = replace(config.material, textureless_share=1.0, random_colour_share=0.0, saturation=(1, 1), value=(1, 1))
+    np.testing.assert_allclose(sampling.draw_material(rng, mean, tug_target).base_rgb, tug_target.mean_rgb, atol=1e-6)
+    assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in looks if m.base_rgb is not None)
+
+
+def test_panoramas_light_and_show_their_shares_and_stand_upright(config_of, tug_target):
+    config = config_of("lights.hdri_share=0.6", "background.hdri_share=0.5", "view.viewpoint=upright")
+    assets = Assets(hdris=("a.hdr", "b.hdr"))
+    drawn = [sampling.draw_scene(config, [tug_target], assets, Purpose.PAIRS, i, 0) for i in range(150)]
+    lit = [d for d in drawn if d.environment is not None]
+    assert len(lit) / 150 == pytest.approx(0.6, abs=0.12)
+    assert np.mean([d.background.kind == "environment" for d in lit]) == pytest.approx(0.5, abs=0.15)
+    assert {d.environment.path for d in lit} == {"a.hdr", "b.hdr"}
+    for d in lit:
+        assert d.lights == ()
+        np.testing.assert_allclose(d.environment.R_cam_env[:, 2], d.T_cam_obj[:3, 2], atol=1e-9)
+    for d in drawn:
+        if d.environment is None:
+            assert d.background.kind != "environment"
+    plain = [draw(config, tug_target, i) for i in range(20)]
+    assert all(np.array_equal(a.T_cam_obj, b.T_cam_obj) for a, b in zip(plain, drawn, strict=False))

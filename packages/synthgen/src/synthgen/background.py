@@ -1,4 +1,4 @@
-"""Backgrounds: drawn ones of many kinds, and random crops of photographs."""
+"""Backgrounds: drawn ones of many kinds, random crops of photographs, and what a panorama shows."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from posecore.errors import ConfigError
 
-from synthgen.scene import Background
+from synthgen import hdri
+from synthgen.scene import Background, Scene
 
 Array = np.ndarray
 Canvas = Float[Array, "h w 3"]
@@ -17,6 +18,24 @@ Canvas = Float[Array, "h w 3"]
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 PHOTO_SIDE_PX = 1280  # photographs are kept at most this large: a crop never needs more and many fit in memory
 PHOTOS_IN_MEMORY = 48
+
+
+def behind(scene: Scene, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+    """What lies behind the rendered objects of a scene, in display colours.
+
+    Args:
+        scene: Its region has the given size.
+        width_px: Width.
+        height_px: Height.
+
+    Raises:
+        ConfigError: A photograph or panorama cannot be read.
+    """
+    if scene.background.kind == "environment":
+        assert scene.environment is not None
+        x0, y0 = scene.region_px[:2]
+        return hdri.crop(scene.environment, scene.camera.K, (x0, y0, width_px, height_px))
+    return draw(scene.background, width_px, height_px)
 
 
 def draw(background: Background, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
@@ -33,10 +52,10 @@ def draw(background: Background, width_px: int, height_px: int) -> UInt8[Array, 
 
 
 def list_photos(folder: str | Path) -> tuple[str, ...]:
-    """Photographs of a folder, sorted by name, subfolders included.
+    """Photographs of a folder, sorted by name, subfolders included; each one's first bytes are looked at.
 
     Raises:
-        ConfigError: The folder is missing or holds no picture.
+        ConfigError: The folder is missing or holds no readable picture, or one of them is broken; the message names it.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -44,6 +63,12 @@ def list_photos(folder: str | Path) -> tuple[str, ...]:
     photos = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES))
     if not photos:
         raise ConfigError(f"--backgrounds {folder}: no picture in it, expected {', '.join(PHOTO_SUFFIXES)} files")
+    broken = [photo for photo in photos if not cv2.haveImageReader(photo)]
+    if len(broken) == len(photos):
+        raise ConfigError(f"--backgrounds {folder}: none of its {len(photos)} pictures is readable, e.g. {broken[0]}")
+    if broken:
+        others = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
+        raise ConfigError(f"{broken[0]}{others}: not a picture; repair it or take it out of --backgrounds {folder}")
     return photos
 
 

@@ -13,7 +13,7 @@ Array = np.ndarray
 def compose(rendered: RenderedScene, scene: Scene) -> UInt8[Array, "h w 3"]:
     """Lay the render over the scene's background in linear light and expose it."""
     height, width = rendered.alpha.shape
-    behind = sensor.linear_from_display(background.draw(scene.background, width, height))
+    behind = sensor.linear_from_display(background.behind(scene, width, height))
     alpha = rendered.alpha[..., None]
     return sensor.expose(rendered.rgb_linear * alpha + behind * (1 - alpha), scene.sensor)
 

@@ -147,10 +147,13 @@ class WindowConfig:
 
     Attributes:
         padding: Added to the largest silhouette box at the smallest distance, as a share of it.
+        shared: Whether all objects have the window of the one that needs the largest, as in datasets of a category,
+            whose members stand for objects that nobody has seen.
         min_area_px: A silhouette with fewer patch pixels rejects the draw.
     """
 
     padding: float = 0.3
+    shared: bool = False
     min_area_px: int = 150
 
     def __post_init__(self) -> None:
@@ -159,10 +162,63 @@ class WindowConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SceneConfig:
+    """Which kinds of scene.
+
+    Attributes:
+        kind: 'cutout' has the object in mid air over a background, with shapes floating around it; 'tabletop' has it on
+            or near a textured plane, among things that lie there; 'mixed' draws one of the two for each scene.
+        tabletop_share: Share of tabletop scenes, only for 'mixed'.
+    """
+
+    kind: Literal["cutout", "tabletop", "mixed"] = "cutout"
+    tabletop_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        _check("tabletop_share", self.tabletop_share, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TabletopConfig:
+    """Scenes of kind 'tabletop'. In-plane rotation is `view.roll_deg`; `view.viewpoint` 'upright' rests with +z up.
+
+    Attributes:
+        elevation_deg: Camera elevation above the table, uniform on the sphere's zone.
+        near_share: Share of scenes with the object in any orientation, its lowest point above the table by
+            `hover_diameter`, instead of at rest.
+        hover_diameter: Height of that lowest point; 0 touches.
+        tables: Number of different tables made for a dataset.
+        size_diameter: Sides of a table, uniform in the logarithm; in units of 0.1 m doubled or halved to come nearest
+            to the object's diameter, so that objects of about one size share their tables.
+        distractors: Number of other things on the table.
+        gap_diameter: Clearance between the circles around two things on the table.
+    """
+
+    elevation_deg: Range = (20.0, 80.0)
+    near_share: float = 0.25
+    hover_diameter: Range = (0.0, 0.25)
+    tables: int = 12
+    size_diameter: Range = (4.0, 10.0)
+    distractors: IntRange = (0, 4)
+    gap_diameter: Range = (0.02, 0.8)
+
+    def __post_init__(self) -> None:
+        _check_range("elevation_deg", self.elevation_deg, 1.0, 90.0)
+        _check("near_share", self.near_share, 0.0, 1.0)
+        _check_range("hover_diameter", self.hover_diameter, 0.0, 2.0)
+        _check("tables", self.tables, 1, 200)
+        _check_range("size_diameter", self.size_diameter, 2.0, 40.0)
+        _check_range("distractors", self.distractors, 0, 50)
+        _check_range("gap_diameter", self.gap_diameter, 0.0, 10.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class LightConfig:
     """Lamps around the object.
 
     Attributes:
+        hdri_share: Share of scenes lit by a panorama instead of lamps, where a folder of panoramas is given; its
+            brightness is drawn from `brightness`, its turn about the vertical uniformly.
         count: Number of lamps.
         brightness: Linear radiance of a white surface that faces all the light, drawn uniformly in its logarithm.
         ambient_share: Share of it that comes evenly from all around.
@@ -171,6 +227,7 @@ class LightConfig:
         size: A lamp's size as a share of its distance; small is hard shadows.
     """
 
+    hdri_share: float = 0.5
     count: IntRange = (1, 3)
     brightness: Range = (0.5, 1.6)
     ambient_share: Range = (0.15, 0.7)
@@ -179,6 +236,7 @@ class LightConfig:
     size: Range = (0.02, 0.6)
 
     def __post_init__(self) -> None:
+        _check("hdri_share", self.hdri_share, 0.0, 1.0)
         _check_range("count", self.count, 0, 16)
         _check_range("brightness", self.brightness, 1e-3, 100.0)
         _check_range("ambient_share", self.ambient_share, 0.0, 1.0)
@@ -192,6 +250,9 @@ class MaterialConfig:
     """Variation of the target's surface around its own colours.
 
     Attributes:
+        textureless_share: Share of scenes in which the object has its mean colour all over.
+        random_colour_share: Share of scenes in which its colours are random: half of them one colour, half a procedural
+            texture of two.
         hue_shift: Largest hue rotation in turns, either way.
         saturation: Factor on the saturation.
         value: Factor on the brightness.
@@ -200,6 +261,8 @@ class MaterialConfig:
         specular: Principled specular level.
     """
 
+    textureless_share: float = 0.0
+    random_colour_share: float = 0.0
     hue_shift: float = 0.04
     saturation: Range = (0.7, 1.3)
     value: Range = (0.75, 1.2)
@@ -208,6 +271,8 @@ class MaterialConfig:
     specular: Range = (0.1, 0.7)
 
     def __post_init__(self) -> None:
+        _check("textureless_share", self.textureless_share, 0.0, 1.0)
+        _check("random_colour_share", self.random_colour_share, 0.0, 1.0 - self.textureless_share)
         _check("hue_shift", self.hue_shift, 0.0, 0.5)
         for name in ("saturation", "value"):
             _check_range(name, getattr(self, name), 0.0, 4.0)
@@ -217,20 +282,26 @@ class MaterialConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OccluderConfig:
-    """Primitive shapes in front of, beside and behind the object.
+    """Shapes in front of, beside and behind the object: primitives, or the meshes of a folder.
 
     Attributes:
-        library: Number of different shapes made for a dataset.
+        library: Number of different shapes made for a dataset; of a folder's meshes at most this many are used.
+        scale: 'fit' gives a folder's meshes `size_diameter`, 'own' leaves them at their own size.
         size_diameter: Diameter of a shape.
         front: Number of shapes that may hide the object.
-        props: Number of shapes around it.
+        props: Number of shapes around it, in cutout scenes.
+        visible_fraction: Wanted visible share of the object, uniform in this range: shapes in front are slid in, and up
+            to four are added, until it is met. Nothing (null) leaves it to where the shapes happen to be. Without
+            effect where `front` allows none.
         min_visible: Smallest visible share of the object; a scene below it is drawn again.
     """
 
     library: int = 32
+    scale: Literal["fit", "own"] = "fit"
     size_diameter: Range = (0.25, 1.0)
     front: IntRange = (0, 2)
     props: IntRange = (0, 3)
+    visible_fraction: Range | None = None
     min_visible: float = 0.4
 
     def __post_init__(self) -> None:
@@ -239,6 +310,13 @@ class OccluderConfig:
         _check_range("front", self.front, 0, 50)
         _check_range("props", self.props, 0, 50)
         _check("min_visible", self.min_visible, 0.0, 1.0)
+        if self.visible_fraction is not None:
+            _check_range("visible_fraction", self.visible_fraction, 0.0, 1.0)
+            if self.visible_fraction[0] < self.min_visible:
+                raise ConfigError(
+                    f"visible_fraction starts at {self.visible_fraction[0]}, expected at least min_visible "
+                    f"({self.min_visible}) because scenes below that are rejected; lower min_visible"
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,12 +324,16 @@ class BackgroundConfig:
     """What lies behind.
 
     Attributes:
-        photo_share: Share of scenes over a photograph where a folder of photographs is given; the rest is drawn.
+        hdri_share: Share of the scenes lit by a panorama that show it as well.
+        photo_share: Share of the other scenes over a photograph where a folder of photographs is given; the rest is
+            drawn.
     """
 
+    hdri_share: float = 0.5
     photo_share: float = 0.7
 
     def __post_init__(self) -> None:
+        _check("hdri_share", self.hdri_share, 0.0, 1.0)
         _check("photo_share", self.photo_share, 0.0, 1.0)
 
 
@@ -291,6 +373,63 @@ class SensorConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FrameConfig:
+    """Whole camera images, as `synthgen bop` renders them.
+
+    Attributes:
+        objects: Number of labelled objects in an image.
+        instances: How often one object may be among them.
+        gap_diameter: Room between two that lie together, in diameters of the one that is added.
+        lights: 'lamps' are those of training pairs; 'ceiling' is a large lamp overhead and a small one around.
+        min_target_visible: Visible share from which an object is to be found (BOP's targets).
+    """
+
+    objects: IntRange = (1, 1)
+    instances: int = 1
+    gap_diameter: Range = (0.02, 0.5)
+    lights: Literal["lamps", "ceiling"] = "lamps"
+    min_target_visible: float = 0.1
+
+    def __post_init__(self) -> None:
+        _check_range("objects", self.objects, 1, 1000)
+        _check("instances", self.instances, 1, 1000)
+        _check_range("gap_diameter", self.gap_diameter, 0.0, 10.0)
+        _check("min_target_visible", self.min_target_visible, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SequenceConfig:
+    """Motion of tracking sequences: how the first object moves as the camera sees it.
+
+    Attributes:
+        fps: Images a second.
+        max_turn_deg_s: Bound on its angular speed.
+        max_speed_diameter_s: Bound on its box centre's speed.
+        smoothness_s: Nothing swings faster than with this period.
+        pass_every_s: A shape passes before it once in every such span; 0 for never.
+        light_swing: Largest change of a lamp's strength either way, as a share.
+        shutter: Share of the time between two images that the shutter is open: what motion blur covers.
+    """
+
+    fps: float = 30.0
+    max_turn_deg_s: float = 90.0
+    max_speed_diameter_s: float = 3.0
+    smoothness_s: float = 2.0
+    pass_every_s: float = 4.0
+    light_swing: float = 0.4
+    shutter: Range = (0.0, 0.5)
+
+    def __post_init__(self) -> None:
+        _check("fps", self.fps, 0.1, 10_000.0)
+        _check("max_turn_deg_s", self.max_turn_deg_s, 0.0, 3600.0)
+        _check("max_speed_diameter_s", self.max_speed_diameter_s, 0.0, 100.0)
+        _check("smoothness_s", self.smoothness_s, 0.05, 3600.0)
+        _check("pass_every_s", self.pass_every_s, 0.0, 3600.0)
+        _check("light_swing", self.light_swing, 0.0, 0.9)
+        _check_range("shutter", self.shutter, 0.0, 1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SynthConfig:
     """A dataset's whole recipe; with the object and the number of samples it decides every byte.
 
@@ -309,11 +448,15 @@ class SynthConfig:
         view: Viewpoint and place in the image.
         perturbation: Distance of the hypotheses from the truth.
         window: Fixed window.
+        scene: Kinds of scene.
+        tabletop: Scenes on a table.
         lights: Lamps.
         material: The object's surface.
         occluders: Shapes around it.
         background: What lies behind.
         sensor: Camera effects.
+        frames: Whole camera images.
+        sequence: Motion of tracking sequences.
     """
 
     seed: int = 0
@@ -323,18 +466,22 @@ class SynthConfig:
     samples: int = 16
     patch_px: int = 224
     contour_points: int = 100
-    hypotheses_per_scene: int = 4
+    hypotheses_per_scene: int = 8
     shard_size: int = 64
     camera: CameraConfig = field(default_factory=CameraConfig)
     distance: DistanceConfig = field(default_factory=DistanceConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    tabletop: TabletopConfig = field(default_factory=TabletopConfig)
     lights: LightConfig = field(default_factory=LightConfig)
     material: MaterialConfig = field(default_factory=MaterialConfig)
     occluders: OccluderConfig = field(default_factory=OccluderConfig)
     background: BackgroundConfig = field(default_factory=BackgroundConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
+    frames: FrameConfig = field(default_factory=FrameConfig)
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
 
     def __post_init__(self) -> None:
         _check("seed", self.seed, 0, 2**63 - 1)

@@ -11,21 +11,20 @@ from posecore import config as config_tools
 from posecore.bop import ModelInfo, load_models_info, write_models
 from posecore.bop.jsonfile import read_json
 from posecore.errors import ConfigError, DatasetError
-from posecore.files import sha256_bytes, sha256_file
 from posecore.mesh import Mesh
 
+from synthgen.assets import Assets
 from synthgen.config import SynthConfig
-from synthgen.target import Target, make_target
+from synthgen.target import Target, make_targets
 
 # What decides the bytes of a sample beside the project itself.
-_PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "zarr", "moderngl", "trimesh")
+_PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "numcodecs", "moderngl", "trimesh")
 _UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
 DEPTH_STEPS = 65535  # depth is stored in 16 bits
 FINEST_DEPTH_STEP_M = 1e-4
-_DEPTH_BEHIND_DIAMETER = 4.0  # how far behind the object its props reach
 
 
-def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: Sequence[str]) -> dict[str, Any]:
+def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], assets: Assets) -> dict[str, Any]:
     """The data card: nothing in it depends on time, machine or number of workers.
 
     Raises:
@@ -33,7 +32,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
     """
     if n < 1:
         raise ConfigError(f"--n {n}: expected at least 1 sample")
-    targets = [make_target(obj_id, mesh, config) for obj_id, mesh in sorted(meshes.items())]
+    targets = make_targets(meshes, config)
     camera = config.camera
     return {
         "n": n,
@@ -47,6 +46,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
             str(t.obj_id): {
                 "name": t.name,
                 "path": f"models/obj_{t.obj_id:06d}.ply",
+                "texture": None if t.mesh.texture_rgb is None else f"models/obj_{t.obj_id:06d}.png",
                 "sha256": t.mesh.sha256,
                 "diameter_m": t.mesh.diameter_m,
                 "window_side_px": t.window_side_px,
@@ -54,7 +54,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
             for t in targets
         },
         "camera": config_tools.to_dict(camera),
-        "backgrounds": {"photos": len(photos), "sha256": _photos_hash(photos)} if photos else None,
+        **assets.card(),
         "units": _UNITS,
         "versions": versions(config),
     }
@@ -62,7 +62,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], photos: S
 
 def depth_step_m(targets: Sequence[Target]) -> float:
     """Step that depth is stored in: 0.1 mm, doubled until the deepest scene of the largest object fits."""
-    deepest_m = max(t.distance_m[1] + _DEPTH_BEHIND_DIAMETER * t.mesh.diameter_m for t in targets)
+    deepest_m = max(t.distance_m[1] + t.reach_m for t in targets)
     step_m = FINEST_DEPTH_STEP_M
     while deepest_m > DEPTH_STEPS * step_m:
         step_m *= 2
@@ -96,12 +96,11 @@ def load_symmetries(path: str | None, meshes: Mapping[int, Mesh]) -> dict[int, M
 
 
 def estimated_bytes(config: SynthConfig, n: int) -> int:
-    """Rough size of a dataset on disk, from measured sizes of compressed samples (about 4 bytes a patch pixel)."""
-    return n * (4 * config.patch_px**2 + 24 * config.contour_points)
+    """Rough size of a dataset on disk without rendering anything; `synthgen.estimate` measures.
 
-
-def _photos_hash(photos: Sequence[str]) -> str:
-    return sha256_bytes("".join(sha256_file(p) for p in photos).encode())
+    `benchmarks/shard_codecs.py` finds 2.2 to 2.3 bytes a patch pixel at 224 px, and 10 a contour point.
+    """
+    return round(n * (2.3 * config.patch_px**2 + 20 * config.contour_points))
 
 
 def versions(config: SynthConfig) -> dict[str, str]:

@@ -11,9 +11,11 @@ from posecore.mesh import Mesh
 from synthgen.scene import Scene
 
 EngineName = Literal["cycles", "eevee", "raster"]
-Device = Literal["cpu", "gpu"]
+Device = Literal["auto", "cpu", "cuda", "optix"]
 
 ENGINE_NAMES: tuple[str, ...] = get_args(EngineName)
+GPU_DEVICES: tuple[Device, ...] = ("optix", "cuda")
+"""What 'auto' takes, the fastest first; without either it takes the CPU."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,7 +1,9 @@
-"""Primitive shapes that stand in front of, beside and behind the object."""
+"""Shapes that stand in front of, beside and behind the object: primitives, or meshes of the user's."""
 
 import colorsys
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -16,6 +18,22 @@ from synthgen.streams import Purpose, Subject, stream
 Array = np.ndarray
 
 _SHARP_EDGE_RAD = 0.6  # faces that meet at more than this are shaded flat
+_LARGEST_SHARE_OF_DISTANCE = 0.6  # a larger shape has no place between camera and object
+_EXTRA_FRONT = 4  # shapes that may be added to reach a wanted visible share
+_BISECTIONS = 6
+_NEAR_ENOUGH = 0.02  # of the wanted visible share
+
+
+def fitted(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float, meshes: Sequence[Mesh]) -> list[Mesh]:
+    """Occluder meshes scaled to `config.size_diameter` times the object's diameter, each once, about their centres."""
+    rng = stream(seed, Purpose.PAIRS, Subject.LIBRARY, obj_id)
+    chosen = sorted(rng.permutation(len(meshes))[: config.library].tolist())
+    shapes = []
+    for i in chosen:
+        size_m = diameter_m * rng.uniform(*config.size_diameter)
+        vertices = (meshes[i].vertices_m - meshes[i].center_m) * (size_m / meshes[i].diameter_m)
+        shapes.append(replace(meshes[i], vertices_m=vertices))
+    return shapes
 
 
 def library(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float) -> list[Mesh]:
@@ -37,21 +55,111 @@ def place(
     shapes: Mapping[int, Mesh],
     centre_cam_m: Float[Array, "3"],
     diameter_m: float,
-) -> tuple[SceneObject, ...]:
-    """Place shapes around an object whose box centre is at `centre_cam_m`.
+) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
+    """Place shapes in front of and around an object whose box centre is at `centre_cam_m`.
 
     Those in front reach over the object's edge more or less; whether too much of it is hidden only a render can tell
-    (see `pair.PairMaker`). Those around it keep clear of its bounding sphere.
+    (see `pair.PairMaker`). Those around it keep clear of its bounding sphere. A shape that is too large to stand
+    between camera and object is not used.
+
+    Returns:
+        Those in front and those around.
     """
-    keys = sorted(shapes)
-    placed = []
-    for _ in range(rng.integers(config.front[0], config.front[1] + 1)):
+    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _LARGEST_SHARE_OF_DISTANCE * centre_cam_m[2]]
+    front, props = [], []
+    for _ in range(rng.integers(config.front[0], config.front[1] + 1) if keys else 0):
         key = keys[int(rng.integers(len(keys)))]
-        placed.append(_object(rng, shapes, key, _in_front(rng, centre_cam_m, diameter_m, shapes[key].diameter_m)))
-    for _ in range(rng.integers(config.props[0], config.props[1] + 1)):
+        front.append(_object(rng, shapes, key, _in_front(rng, centre_cam_m, diameter_m, shapes[key].diameter_m)))
+    for _ in range(rng.integers(config.props[0], config.props[1] + 1) if keys else 0):
         key = keys[int(rng.integers(len(keys)))]
-        placed.append(_object(rng, shapes, key, _around(rng, centre_cam_m, diameter_m, shapes[key].diameter_m)))
-    return tuple(placed)
+        props.append(_object(rng, shapes, key, _around(rng, centre_cam_m, diameter_m, shapes[key].diameter_m)))
+    return tuple(front), tuple(props)
+
+
+def slide_in(
+    rng: np.random.Generator,
+    config: OccluderConfig,
+    shapes: Mapping[int, Mesh],
+    centre_cam_m: Float[Array, "3"],
+    diameter_m: float,
+    front: Sequence[SceneObject],
+    visible_of: Callable[[tuple[SceneObject, ...]], float],
+    lift: Callable[[SceneObject], SceneObject],
+) -> tuple[SceneObject, ...]:
+    """Slide shapes in front of an object until as much of it is visible as `config.visible_fraction` draws.
+
+    One shape after another comes in from outside towards a place over the object. The first one that would hide too
+    much is stopped on its way, by bisection. Where all of them hide too little, up to four more are added.
+
+    Args:
+        rng: Stream of the wanted share, of the places and of the added shapes.
+        config: Its `visible_fraction` must be set.
+        shapes: Occluder meshes by key.
+        centre_cam_m: The object's box centre.
+        diameter_m: The object's diameter.
+        front: Shapes in front, as `place` made them.
+        visible_of: The object's visible share with these shapes in front, as a small render sees it.
+        lift: Moves a shape out of the table.
+
+    Returns:
+        The shapes in front, none that does not reach the object.
+    """
+    assert config.visible_fraction is not None
+    wanted = rng.uniform(*config.visible_fraction)
+    waiting = list(front)
+    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _LARGEST_SHARE_OF_DISTANCE * centre_cam_m[2]]
+    placed: tuple[SceneObject, ...] = ()
+    if config.front[1] == 0 or not keys or visible_of(placed) <= wanted + _NEAR_ENOUGH:
+        return placed
+    for _ in range(len(waiting) + _EXTRA_FRONT):
+        if waiting:
+            item = waiting.pop(0)
+        else:
+            key = keys[int(rng.integers(len(keys)))]
+            item = _object(rng, shapes, key, _in_front(rng, centre_cam_m, diameter_m, shapes[key].diameter_m))
+        way = _way_in(rng, item, shapes[item.mesh_key], centre_cam_m, diameter_m, lift)
+        inside = (*placed, way(1.0))
+        visible = visible_of(inside)
+        if visible > wanted + _NEAR_ENOUGH:
+            placed = inside
+            continue
+        if visible >= wanted - _NEAR_ENOUGH:
+            return inside
+        low, high = 0.0, 1.0  # hides too little, hides too much
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            visible = visible_of((*placed, way(middle)))
+            if abs(visible - wanted) <= _NEAR_ENOUGH:
+                low = middle
+                break
+            low, high = (middle, high) if visible > wanted else (low, middle)
+        return (*placed, way(low))
+    return placed
+
+
+def _way_in(
+    rng: np.random.Generator,
+    item: SceneObject,
+    shape: Mesh,
+    centre_cam_m: Float[Array, "3"],
+    diameter_m: float,
+    lift: Callable[[SceneObject], SceneObject],
+) -> Callable[[float], SceneObject]:
+    """A shape's way at its own depth from where it hides nothing (0) to a place over the object (1)."""
+    at = item.T_cam_obj[:3, :3] @ shape.center_m + item.T_cam_obj[:3, 3]
+    scale = at[2] / centre_cam_m[2]
+    angle = rng.uniform(0, 2 * math.pi)
+    over = centre_cam_m * scale + _sideways(rng) * rng.uniform(0.0, 0.35) * diameter_m * scale
+    out = centre_cam_m * scale + np.array([math.cos(angle), math.sin(angle), 0.0]) * 0.75 * (
+        diameter_m * scale + shape.diameter_m
+    )
+
+    def place_at(share: float) -> SceneObject:
+        T = item.T_cam_obj.copy()
+        T[:3, 3] += out + (over - out) * share - at
+        return lift(replace(item, T_cam_obj=T))
+
+    return place_at
 
 
 def _in_front(
@@ -85,17 +193,21 @@ def _object(
     rng: np.random.Generator, shapes: Mapping[int, Mesh], key: int, position_cam_m: Float[Array, "3"]
 ) -> SceneObject:
     R = random_rotation(rng)
+    t = position_cam_m - R @ shapes[key].center_m
+    return SceneObject(mesh_key=key, T_cam_obj=make_T(R, t), material=look(rng))
+
+
+def look(rng: np.random.Generator) -> Material:
+    """A shape's surface: its own colours turned to another hue, or one colour all over."""
     own_colours = rng.random() < 0.4
     base = None if own_colours else colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 1.0), rng.uniform(0.05, 1.0))
-    material = Material(
+    return Material(
         base_rgb=base,
         hue_shift=float(rng.uniform(-0.5, 0.5)) if own_colours else 0.0,
         roughness=float(rng.uniform(0.1, 1.0)),
         metallic=float(rng.random() < 0.15),
         specular=float(rng.uniform(0.1, 0.9)),
     )
-    t = position_cam_m - R @ shapes[key].center_m
-    return SceneObject(mesh_key=key, T_cam_obj=make_T(R, t), material=material)
 
 
 def _shape(rng: np.random.Generator, index: int, size_m: float) -> Mesh:

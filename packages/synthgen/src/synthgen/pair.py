@@ -1,26 +1,29 @@
 """Pairs of scene and hypothesis patches with their labels: all samples of one scene at a time."""
 
+import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from posecore.camera import Camera, crop_K
 from posecore.contour import contour_mask, distance_transform_px, sample_contour
-from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 from posecore.raster import Instance, Rasteriser
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import Window, centred, cut, fixed_window
 
 from synthgen import sampling
+from synthgen.assets import Assets
 from synthgen.compose import compose, on_black
 from synthgen.config import SynthConfig
 from synthgen.engine import Engine, RenderedScene
 from synthgen.engines import make_engine
 from synthgen.region import bounds, holds, inside_image, region_of, scaled_camera, scaled_window, within
+from synthgen.rejection import Tally, nothing_accepted
 from synthgen.sampling import SceneDraw
 from synthgen.scene import Light, Scene, SceneObject
 from synthgen.streams import Purpose, Subject, stream
@@ -79,7 +82,7 @@ class PairMaker:
     Args:
         config: Recipe.
         targets: Objects.
-        photos: Background photographs.
+        assets: Photographs, panoramas and the like; none by default.
         threads: Threads of a Blender engine, 0 for all cores; results do not depend on it.
 
     Raises:
@@ -87,15 +90,15 @@ class PairMaker:
     """
 
     def __init__(
-        self, config: SynthConfig, targets: Sequence[Target], photos: Sequence[str] = (), *, threads: int = 0
+        self, config: SynthConfig, targets: Sequence[Target], assets: Assets | None = None, *, threads: int = 0
     ) -> None:
         self.config = config
         self.targets = tuple(targets)
-        self.photos = tuple(photos)
+        self.assets = assets or Assets()
         self.camera: Camera = config.camera.camera()
         meshes: dict[int, Mesh] = {}
         for target in targets:
-            meshes |= {target.obj_id: target.mesh, **target.shapes}
+            meshes |= {target.obj_id: target.mesh, **target.shapes, **target.tables}
         self._engines: dict[str, Engine] = {}
         for name in dict.fromkeys((config.engine, config.hypothesis_engine)):
             # the rasteriser's own hypothesis render needs no engine
@@ -121,9 +124,11 @@ class PairMaker:
         Raises:
             ConfigError: No acceptable scene or hypothesis is found with this configuration.
         """
-        draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, first_attempt)
-        while (hypotheses := self._hypotheses(draw, scene_index)) is None:
-            draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, rejected_scenes + 1)
+        tally = Tally()
+        draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, first_attempt, tally)
+        while (hypotheses := self._hypotheses(draw, scene_index, tally)) is None:
+            tally["no hypothesis"] += 1
+            draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, rejected_scenes + 1, tally)
         shot = self._shoot(draw, [h.window for h in hypotheses])
         rows = [
             self._sample(draw, scene_index, number, hypothesis, rejected_scenes, shot)
@@ -131,13 +136,16 @@ class PairMaker:
         ]
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
-    def accepted_scene(self, purpose: Purpose, scene_index: int, first_attempt: int = 0) -> tuple[SceneDraw, int]:
+    def accepted_scene(
+        self, purpose: Purpose, scene_index: int, first_attempt: int = 0, tally: Tally | None = None
+    ) -> tuple[SceneDraw, int]:
         """Draw scenes until one shows enough of its object.
 
         Args:
             purpose: Pairs or frames.
             scene_index: Which scene.
             first_attempt: Draws before this one are known to be unusable.
+            tally: Why draws were rejected so far; what this call rejects is added.
 
         Returns:
             The scene and how many were rejected before it.
@@ -145,21 +153,24 @@ class PairMaker:
         Raises:
             ConfigError: None of many draws is acceptable.
         """
+        tally = Tally() if tally is None else tally
         for attempt in range(first_attempt, MAX_ATTEMPTS):
-            draw = sampling.draw_scene(self.config, self.targets, self.photos, purpose, scene_index, attempt)
+            draw = sampling.draw_scene(self.config, self.targets, self.assets, purpose, scene_index, attempt)
             box = sampling.target_box(draw.target, self.camera, draw.T_cam_obj)
             inside = sampling.share_inside(box, self.camera)
             if inside < self.config.view.min_inside:
+                tally["outside"] += 1
                 continue
+            draw = sampling.slide_in(draw, self.config, partial(self._visible, box))
             area_px, visible = self._glance(draw, box)
-            if area_px >= self.config.window.min_area_px and visible * inside >= self.config.occluders.min_visible:
+            if area_px < self.config.window.min_area_px:
+                tally["small"] += 1
+            elif visible * inside < self.config.occluders.min_visible:
+                tally["hidden"] += 1
+            else:
                 return draw, attempt
-        raise ConfigError(
-            f"scene {scene_index}: {MAX_ATTEMPTS} draws in a row are unusable: the object is hidden, too small, out of "
-            "the image, or no hypothesis fits the window; lower occluders.front, occluders.min_visible, "
-            "view.position_jitter, distance.max, window.min_area_px or perturbation.max_translation_diameter, or "
-            "raise window.padding"
-        )
+        target = self.targets[sampling.target_of(self.config.seed, purpose, scene_index, len(self.targets))]
+        raise nothing_accepted(scene_index, target.name, tally, self.config)
 
     def render_frame(self, scene_index: int) -> tuple[SceneDraw, RenderedScene, UInt8[Array, "h w 3"]]:
         """Render a whole camera image of a scene that no training pair shows."""
@@ -185,6 +196,10 @@ class PairMaker:
         rendered = self._engines[self.config.engine].render(scene)
         return Shot(rendered=rendered, image=compose(rendered, scene), region_px=region, scale=scale)
 
+    def _visible(self, box: Float[Array, "4"], draw: SceneDraw) -> float:
+        """The object's visible share at a glance."""
+        return self._glance(draw, box)[1]
+
     def _glance(self, draw: SceneDraw, box: Float[Array, "4"]) -> tuple[float, float]:
         """Look at low resolution: the silhouette's area in patch pixels and the share that occluders leave free."""
         x0, y0, x1, y1 = box
@@ -202,7 +217,7 @@ class PairMaker:
         visible = (glance.instance == 0).sum()
         return area_px, float(visible / alone)
 
-    def _hypotheses(self, draw: SceneDraw, scene_index: int) -> list[Hypothesis] | None:
+    def _hypotheses(self, draw: SceneDraw, scene_index: int, tally: Tally) -> list[Hypothesis] | None:
         """Draw hypotheses until each has one whose silhouettes lie in the window and are large enough.
 
         None when the scene does not allow that: then another scene is drawn.
@@ -213,7 +228,7 @@ class PairMaker:
             candidates: dict[int, tuple[Float[Array, "4 4"], Window]] = {}
             for number in attempts:
                 if number not in accepted:
-                    candidate = self._next_candidate(draw, scene_index, number, attempts)
+                    candidate = self._next_candidate(draw, scene_index, number, attempts, tally)
                     if candidate is None:
                         return None
                     candidates[number] = candidate
@@ -222,11 +237,12 @@ class PairMaker:
                 if small >= self.config.window.min_area_px:
                     accepted[number] = hypothesis
                 else:
+                    tally["too small"] += 1
                     attempts[number] += 1
         return [accepted[number] for number in sorted(accepted)]
 
     def _next_candidate(
-        self, draw: SceneDraw, scene_index: int, number: int, attempts: dict[int, int]
+        self, draw: SceneDraw, scene_index: int, number: int, attempts: dict[int, int], tally: Tally
     ) -> tuple[Float[Array, "4 4"], Window] | None:
         """The next draw of a hypothesis whose window holds both silhouettes' boxes, None after many that do not."""
         truth = sampling.target_box(draw.target, self.camera, draw.T_cam_obj)
@@ -238,6 +254,7 @@ class PairMaker:
                 window = fixed_window(draw.target.hull_m, self.camera.K, T, draw.target.window_side_px)
                 if holds(window, truth) and holds(window, box):
                     return T, window
+            tally["left window"] += 1
             attempts[number] += 1
         return None
 
@@ -284,6 +301,7 @@ class PairMaker:
             cut(shot.rendered.depth_m, local, p, interpolation="nearest"),
             cut(shot.rendered.index, local, p, interpolation="nearest", fill=-1),
             inside_image(window, p, self.camera),
+            reach_px=math.ceil(max(1.0, p / window.side_px)) + 1,
         )
         amodal = hypothesis.truth_depth_m > 0
         shape = hypothesis.depth_m > 0
@@ -340,19 +358,32 @@ def _scene_labels(
     engine_depth_m: Float[Array, "p p"],
     engine_index: Array,
     inside: Bool[Array, "p p"],
+    reach_px: int,
 ) -> tuple[Float[Array, "p p"], UInt8[Array, "p p"]]:
     """Depth and mask bits of the scene patch.
 
     The object's own silhouette and depth are exact at the patch's resolution; what hides it comes from the engine's
     layers, cut to nearest. A silhouette pixel is hidden where the engine drew another object nearer than it. Asking
     for index 0 instead would lose a fringe of up to a camera pixel all around the object.
+
+    Args:
+        truth_depth_m: The object alone.
+        engine_depth_m: The scene.
+        engine_index: The scene.
+        inside: What lies in the camera's image.
+        reach_px: More patch pixels than one of the engine's is wide.
     """
     amodal = truth_depth_m > 0
     other = engine_index > 0
     visible = amodal & inside & ~(other & (engine_depth_m < truth_depth_m))
-    # the fringe outside the exact silhouette, where the engine's coarser pixel still shows the object, is background
-    depth = np.where(visible, truth_depth_m, np.where(other & inside, engine_depth_m, np.float32(0.0)))
-    foreground = visible | (other & inside)
+    other_depth_m = np.where(other & inside, engine_depth_m, np.float32(0.0))
+    # In the fringe outside the exact silhouette, where the engine's coarser pixel still shows the object, lies what
+    # lies next to it: another object (a table goes on there), or background.
+    fringe = (engine_index == 0) & ~amodal & inside
+    near = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    other_depth_m = np.where(fringe, cv2.dilate(other_depth_m, near), other_depth_m)
+    depth = np.where(visible, truth_depth_m, other_depth_m)
+    foreground = visible | (other_depth_m > 0)
     mask = amodal * BIT_OBJECT + visible * BIT_VISIBLE + foreground * BIT_FOREGROUND
     return depth.astype(np.float32), mask.astype(np.uint8)
 

@@ -7,13 +7,16 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
-from posecore.camera import crop_K
+from posecore.camera import back_project, crop_K
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
 from posecore.raster import MAX_LIGHTS, DirectionalLight, Instance, Rasteriser, SceneLayers, Shading
+from posecore.se3 import apply, inverse
 from posecore.window import Window
 
+from synthgen import pattern
 from synthgen.engine import RenderedScene
+from synthgen.hdri import with_lamps
 from synthgen.scene import Light, Material, Scene, Vector
 from synthgen.sensor import linear_from_display
 
@@ -51,17 +54,18 @@ class RasterEngine:
             Instance(
                 obj_id=o.mesh_key if o.material.base_rgb is None else _WHITE_KEY + o.mesh_key,
                 T_cam_obj=o.T_cam_obj,
-                tint=o.material.base_rgb or (1.0, 1.0, 1.0),
+                tint=(o.material.base_rgb if o.material.pattern is None else None) or (1.0, 1.0, 1.0),
             )
             for o in scene.objects
         ]
+        scene = with_lamps(scene)
         K = crop_K(scene.camera.K, Window(x0_px=x0, y0_px=y0, side_px=1.0), 1)
         fine_K = np.diag([_SUPERSAMPLING, _SUPERSAMPLING, 1.0]) @ K
         size = (width * _SUPERSAMPLING, height * _SUPERSAMPLING)
         shading = _shading(scene)
         fine = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
         exact = self._rasteriser.render_scene(instances, K, width, height, rgb=False)
-        rgb_linear, alpha = _resolve(linear_from_display(_recolour(fine, scene)), fine.instance >= 0)
+        rgb_linear, alpha = _resolve(linear_from_display(_recolour(fine, scene, fine_K)), fine.instance >= 0)
         return RenderedScene(
             rgb_linear=rgb_linear, alpha=alpha, depth_m=exact.depth_m, index=exact.instance.astype(np.int16)
         )
@@ -106,8 +110,8 @@ def _display_factor(rgb: Vector, scale: float) -> Vector:
     return (r, g, b)
 
 
-def _recolour(layers: SceneLayers, scene: Scene) -> UInt8[Array, "h w 3"]:
-    """Apply each material's hue, saturation and value to the pixels of its object."""
+def _recolour(layers: SceneLayers, scene: Scene, K: Float[Array, "3 3"]) -> UInt8[Array, "h w 3"]:
+    """Apply each material's pattern, or its hue, saturation and value, to the pixels of its object."""
     rgb = layers.rgb
     assert rgb is not None
     for i, placed in enumerate(scene.objects):
@@ -116,6 +120,10 @@ def _recolour(layers: SceneLayers, scene: Scene) -> UInt8[Array, "h w 3"]:
             inside = layers.instance == i
             if inside.any():
                 rgb[inside] = _shift(rgb[inside], material)
+        elif material.pattern is not None:
+            v, u = np.nonzero(layers.instance == i)
+            p_cam = back_project(K, np.stack([u, v], -1) + 0.5, layers.depth_m[v, u])
+            rgb[v, u] = pattern.paint(rgb[v, u], material, apply(inverse(placed.T_cam_obj), p_cam))
     return rgb
 
 

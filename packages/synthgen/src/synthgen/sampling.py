@@ -1,19 +1,21 @@
 """Draws of scenes and hypotheses: pure functions of (configuration, seed, index, attempt)."""
 
+import colorsys
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from posecore.camera import Camera
-from posecore.se3 import make_T, random_direction, random_rotation, rotation_from_rotvec
+from posecore.se3 import inverse, make_T, random_direction, random_rotation, rotation_from_rotvec
 from posecore.window import silhouette_box
 
-from synthgen import occluders
+from synthgen import occluders, tabletop
+from synthgen.assets import Assets
 from synthgen.config import LightConfig, MaterialConfig, PerturbationConfig, SensorConfig, SynthConfig, ViewConfig
-from synthgen.scene import Background, Light, Material, Scene, SceneObject, Sensor, Vector
+from synthgen.scene import Background, Environment, Light, Material, Pattern, Scene, SceneObject, Sensor, Vector
 from synthgen.streams import Purpose, Subject, child_seed, stream
 from synthgen.target import Target
 
@@ -25,26 +27,37 @@ class SceneDraw:
     """Everything about a scene but the part of the image to render.
 
     Attributes:
+        address: (purpose, scene, attempt) that it was drawn at.
         target: The object.
         T_cam_obj: Its true pose.
-        others: Occluders and props.
+        front: Shapes that float between it and the camera.
+        around: Table and props.
         material: Its surface.
         lights: Lamps.
         ambient_rgb: Even light.
+        environment: Panorama that lights the scene, or none.
         background: What lies behind.
         sensor: Camera effects.
         render_seed: Seed of the renderer's noise.
     """
 
+    address: tuple[Purpose, int, int]
     target: Target
     T_cam_obj: Float[Array, "4 4"]
-    others: tuple[SceneObject, ...]
+    front: tuple[SceneObject, ...]
+    around: tuple[SceneObject, ...]
     material: Material
     lights: tuple[Light, ...]
     ambient_rgb: Vector
+    environment: Environment | None
     background: Background
     sensor: Sensor
     render_seed: int
+
+    @property
+    def others(self) -> tuple[SceneObject, ...]:
+        """Everything beside the target."""
+        return (*self.front, *self.around)
 
     def scene(self, camera: Camera, region_px: tuple[int, int, int, int], samples: int) -> Scene:
         """The scene to render for a part of the image."""
@@ -55,6 +68,7 @@ class SceneDraw:
             objects=(truth, *self.others),
             lights=self.lights,
             ambient_rgb=self.ambient_rgb,
+            environment=self.environment,
             background=self.background,
             sensor=self.sensor,
             samples=samples,
@@ -65,38 +79,137 @@ class SceneDraw:
 def draw_scene(
     config: SynthConfig,
     targets: Sequence[Target],
-    photos: Sequence[str],
+    assets: Assets,
     purpose: Purpose,
     scene_index: int,
     attempt: int,
 ) -> SceneDraw:
-    """Draw a scene. `attempt` 0 is the first; a rejected scene is drawn again with the next."""
+    """Draw a scene. `attempt` 0 is the first; a rejected scene is drawn again with the next.
+
+    The target does not depend on the attempt: objects that are often rejected are shown as often as the others.
+    """
 
     def rng(subject: Subject) -> np.random.Generator:
         return stream(config.seed, purpose, subject, scene_index, attempt)
 
-    pose_rng = rng(Subject.POSE)
-    target = targets[int(pose_rng.integers(len(targets)))]
-    T_cam_obj = draw_pose(pose_rng, config.view, config.camera.camera(), target)
-    centre = T_cam_obj[:3, :3] @ target.mesh.center_m + T_cam_obj[:3, 3]
-    diameter_m = target.mesh.diameter_m
+    target = targets[target_of(config.seed, purpose, scene_index, len(targets))]
+    is_tabletop = _is_tabletop(config, purpose, scene_index)
+    T_cam_obj, T_cam_table, setting = _placed(config, target, rng, is_tabletop)
+    centre, diameter_m = _centre(target, T_cam_obj), target.mesh.diameter_m
+    front, around = occluders.place(rng(Subject.OCCLUDERS), config.occluders, target.shapes, centre, diameter_m)
+    if setting is not None:
+        front = tuple(tabletop.lifted(o, target.shapes[o.mesh_key], T_cam_table) for o in front)
+        around = tabletop.surroundings(
+            rng(Subject.TABLE),
+            config.tabletop,
+            setting,
+            T_cam_table,
+            target.shapes,
+            target.rests,
+            target.tables,
+            diameter_m,
+            occluders.look,
+        )
     lights, ambient_rgb = draw_lights(rng(Subject.LIGHTS), config.lights, centre, diameter_m)
+    background = draw_background(rng(Subject.BACKGROUND), config.background.photo_share, assets.photos)
+    environment, seen = draw_environment(rng(Subject.ENVIRONMENT), config, assets.hdris, T_cam_table[:3, :3])
+    if environment is not None:
+        lights, ambient_rgb = (), (0.0, 0.0, 0.0)
+        background = Background(kind="environment", seed=background.seed) if seen else background
     return SceneDraw(
+        address=(purpose, scene_index, attempt),
         target=target,
         T_cam_obj=T_cam_obj,
-        others=occluders.place(rng(Subject.OCCLUDERS), config.occluders, target.shapes, centre, diameter_m),
-        material=draw_material(rng(Subject.MATERIAL), config.material),
+        front=front,
+        around=around,
+        material=draw_material(rng(Subject.MATERIAL), config.material, target),
         lights=lights,
         ambient_rgb=ambient_rgb,
-        background=draw_background(rng(Subject.BACKGROUND), config.background.photo_share, photos),
+        environment=environment,
+        background=background,
         sensor=draw_sensor(rng(Subject.SENSOR), config.sensor),
         render_seed=child_seed(rng(Subject.RENDER)),
     )
 
 
+def target_of(seed: int, purpose: Purpose, scene_index: int, count: int) -> int:
+    """Which of `count` targets a scene shows.
+
+    Every block of `count` scenes shows each target once, in an order of its own, so that over any number of scenes from
+    the first on two targets' numbers of scenes differ by one at most.
+    """
+    block, place = divmod(scene_index, count)
+    return int(stream(seed, purpose, Subject.TARGET, block).permutation(count)[place])
+
+
+def _is_tabletop(config: SynthConfig, purpose: Purpose, scene_index: int) -> bool:
+    """Whether a scene has a table; like its target it keeps that over all attempts."""
+    share = {"cutout": 0.0, "tabletop": 1.0, "mixed": config.scene.tabletop_share}[config.scene.kind]
+    return bool(stream(config.seed, purpose, Subject.KIND, scene_index).random() < share)
+
+
+def _placed(
+    config: SynthConfig, target: Target, rng: Callable[[Subject], np.random.Generator], is_tabletop: bool
+) -> tuple[Float[Array, "4 4"], Float[Array, "4 4"], tabletop.Setting | None]:
+    """The object's pose, that of the table or of a level frame in its place, and the setting on the table if any."""
+    pose_rng, camera = rng(Subject.POSE), config.camera.camera()
+    R_cam_table = _level(rng(Subject.VIEW), config.tabletop.elevation_deg, config.view.roll_deg)
+    if not is_tabletop:
+        T_cam_obj = draw_pose(pose_rng, config.view, camera, target)
+        level = T_cam_obj[:3, :3] if config.view.viewpoint == "upright" else R_cam_table
+        return T_cam_obj, make_T(level, np.zeros(3)), None
+    rest = target.rests[target.obj_id]
+    setting = tabletop.set_object(
+        rng(Subject.SETTING), config.tabletop, config.view, rest, target.mesh.diameter_m, target.tables
+    )
+    R = R_cam_table @ setting.T_table_obj[:3, :3]
+    T_cam_obj = _at_distance(pose_rng, config.view, camera, target, R)
+    return T_cam_obj, T_cam_obj @ inverse(setting.T_table_obj), setting
+
+
+def slide_in(draw: SceneDraw, config: SynthConfig, visible_of: Callable[[SceneDraw], float]) -> SceneDraw:
+    """The scene with its shapes in front slid in until the wanted share of the object is visible.
+
+    Args:
+        draw: A scene.
+        config: Recipe; without `occluders.visible_fraction` the scene stays as it is.
+        visible_of: The object's visible share in a scene, as a small render sees it.
+    """
+    if config.occluders.visible_fraction is None:
+        return draw
+    purpose, scene_index, attempt = draw.address
+    shapes = draw.target.shapes
+    tables = [o.T_cam_obj for o in draw.around if o.mesh_key in draw.target.tables]
+
+    def lift(thing: SceneObject) -> SceneObject:
+        return tabletop.lifted(thing, shapes[thing.mesh_key], tables[0]) if tables else thing
+
+    front = occluders.slide_in(
+        stream(config.seed, purpose, Subject.VISIBILITY, scene_index, attempt),
+        config.occluders,
+        shapes,
+        _centre(draw.target, draw.T_cam_obj),
+        draw.target.mesh.diameter_m,
+        draw.front,
+        lambda things: visible_of(replace(draw, front=things)),
+        lift,
+    )
+    return replace(draw, front=front)
+
+
+def _centre(target: Target, T_cam_obj: Float[Array, "4 4"]) -> Float[Array, "3"]:
+    return np.asarray(T_cam_obj[:3, :3] @ target.mesh.center_m + T_cam_obj[:3, 3])
+
+
 def draw_pose(rng: np.random.Generator, view: ViewConfig, camera: Camera, target: Target) -> Float[Array, "4 4"]:
     """Draw a true pose: rotation by `view.viewpoint`, distance uniform, box centre around the image's middle."""
-    R = random_rotation(rng) if view.viewpoint == "so3" else _upright(rng, view)
+    R = random_rotation(rng) if view.viewpoint == "so3" else _level(rng, view.elevation_deg, view.roll_deg)
+    return _at_distance(rng, view, camera, target, R)
+
+
+def _at_distance(
+    rng: np.random.Generator, view: ViewConfig, camera: Camera, target: Target, R: Float[Array, "3 3"]
+) -> Float[Array, "4 4"]:
     z = rng.uniform(*target.distance_m)
     half = np.array([camera.width_px, camera.height_px]) / 2
     uv = half * (1.0 + view.position_jitter * rng.uniform(-1.0, 1.0, 2))
@@ -105,11 +218,13 @@ def draw_pose(rng: np.random.Generator, view: ViewConfig, camera: Camera, target
     return make_T(R, centre - R @ target.mesh.center_m)
 
 
-def _upright(rng: np.random.Generator, view: ViewConfig) -> Float[Array, "3 3"]:
-    """Rotation of a camera around an object whose z axis points up; elevations uniform on the sphere's zone."""
-    low, high = np.sin(np.deg2rad(view.elevation_deg))
+def _level(
+    rng: np.random.Generator, elevation_deg: tuple[float, float], roll_deg: tuple[float, float]
+) -> Float[Array, "3 3"]:
+    """Rotation from a frame whose z axis points up to a camera around it; elevations uniform on the sphere's zone."""
+    low, high = np.sin(np.deg2rad(elevation_deg))
     elevation, azimuth = math.asin(rng.uniform(low, high)), rng.uniform(0, 2 * math.pi)
-    roll = math.radians(rng.uniform(*view.roll_deg))
+    roll = math.radians(rng.uniform(*roll_deg))
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     forward = -np.array(
         [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
@@ -174,9 +289,9 @@ def draw_lights(
     return tuple(lights), _vector(ambient)
 
 
-def draw_material(rng: np.random.Generator, config: MaterialConfig) -> Material:
-    """Draw how the object's surface departs from its own colours."""
-    return Material(
+def draw_material(rng: np.random.Generator, config: MaterialConfig, target: Target) -> Material:
+    """Draw how the object's surface departs from its own colours, or replaces them."""
+    material = Material(
         hue_shift=float(rng.uniform(-config.hue_shift, config.hue_shift)),
         saturation=float(rng.uniform(*config.saturation)),
         value=float(rng.uniform(*config.value)),
@@ -184,6 +299,57 @@ def draw_material(rng: np.random.Generator, config: MaterialConfig) -> Material:
         metallic=float(rng.uniform(*config.metallic)),
         specular=float(rng.uniform(*config.specular)),
     )
+    kind = rng.random()
+    if kind < config.textureless_share:
+        mean = _vector(target.mean_rgb)
+        hue, saturation, value = colorsys.rgb_to_hsv(*mean)
+        changed = ((hue + material.hue_shift) % 1.0, saturation * material.saturation, value * material.value)
+        base = colorsys.hsv_to_rgb(changed[0], min(changed[1], 1.0), min(changed[2], 1.0))
+    elif kind < config.textureless_share + config.random_colour_share:
+        base = _any_colour(rng)
+    else:
+        return material
+    is_patterned = kind >= config.textureless_share and rng.random() < 0.5
+    pattern = _pattern(rng, target.mesh.diameter_m) if is_patterned else None
+    return replace(material, base_rgb=base, pattern=pattern, hue_shift=0.0, saturation=1.0, value=1.0)
+
+
+def _any_colour(rng: np.random.Generator) -> Vector:
+    return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 1.0), rng.uniform(0.1, 1.0))
+
+
+def _pattern(rng: np.random.Generator, diameter_m: float) -> Pattern:
+    """Bands of another colour, 2 to 15 over the diameter, straight or bent."""
+    wave = random_direction(rng) * 2 * math.pi * math.exp(rng.uniform(math.log(2), math.log(15))) / diameter_m
+    warp = random_direction(rng) * 2 * math.pi * rng.uniform(1.0, 6.0) / diameter_m
+    bend = float(rng.uniform(0.0, 6.0)) if rng.random() < 0.7 else 0.0
+    return Pattern(
+        accent_rgb=_any_colour(rng),
+        wave=_vector(wave),
+        warp=_vector(warp),
+        bend=bend,
+        sharpness=float(math.exp(rng.uniform(0.0, math.log(20.0)))),
+    )
+
+
+def draw_environment(
+    rng: np.random.Generator, config: SynthConfig, hdris: Sequence[str], R_cam_level: Float[Array, "3 3"]
+) -> tuple[Environment | None, bool]:
+    """Draw which panorama lights a scene, if any, and whether it is seen behind.
+
+    Args:
+        rng: Stream.
+        config: Recipe.
+        hdris: Panoramas.
+        R_cam_level: Rotation from a frame whose z axis points up; the panorama stands upright in it.
+    """
+    if not hdris or rng.random() >= config.lights.hdri_share:
+        return None, False
+    path = hdris[int(rng.integers(len(hdris)))]
+    turn = rotation_from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * math.pi)]))
+    strength = math.exp(rng.uniform(*np.log(config.lights.brightness)))
+    seen = bool(rng.random() < config.background.hdri_share)
+    return Environment(path=path, R_cam_env=R_cam_level @ turn, strength=strength), seen
 
 
 def draw_background(rng: np.random.Generator, photo_share: float, photos: Sequence[str]) -> Background:

@@ -16,7 +16,7 @@ from posecore.camera import Camera
 from posecore.errors import ConfigError
 
 LightKind = Literal["point", "area", "sun"]
-BackgroundKind = Literal["procedural", "photo"]
+BackgroundKind = Literal["procedural", "photo", "environment"]
 
 Vector = tuple[float, float, float]
 
@@ -43,11 +43,41 @@ def _vector(where: str, value: Sequence[float], low: float = -math.inf, high: fl
 
 
 @dataclass(frozen=True, kw_only=True)
+class Pattern:
+    """A procedural texture that fills space: bands, bent by waves across them.
+
+    At p, in metres and object coordinates, the share of the accent colour is a smooth step, `sharpness` steep, of
+    sin(wave . p + bend sin(warp . p)). The same formula is evaluated by Blender's nodes and by `pattern.share`.
+
+    Attributes:
+        accent_rgb: Display (sRGB) colour that stands beside the material's base colour.
+        wave: Wave vector of the bands, rad/m.
+        warp: Wave vector of what bends them, rad/m.
+        bend: How far it bends them, rad.
+        sharpness: 1 is a soft wave, 20 has hard edges.
+    """
+
+    accent_rgb: Vector
+    wave: Vector
+    warp: Vector = (0.0, 0.0, 0.0)
+    bend: float = 0.0
+    sharpness: float = 4.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "accent_rgb", _vector("pattern.accent_rgb", self.accent_rgb, 0.0, 1.0))
+        object.__setattr__(self, "wave", _vector("pattern.wave", self.wave))
+        object.__setattr__(self, "warp", _vector("pattern.warp", self.warp))
+        _number("pattern.bend", self.bend, 0.0, 100.0)
+        _number("pattern.sharpness", self.sharpness, 1.0, 100.0)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Material:
     """How one object's surface looks.
 
     Attributes:
         base_rgb: Display (sRGB) colour in [0, 1] that replaces the mesh's own colours; None keeps the mesh's own.
+        pattern: Procedural texture between `base_rgb` and another colour; None leaves the base colour plain.
         hue_shift: Rotation of the hue in turns, [-0.5, 0.5].
         saturation: Factor on the saturation, [0, 4].
         value: Factor on the brightness, [0, 4].
@@ -57,6 +87,7 @@ class Material:
     """
 
     base_rgb: Vector | None = None
+    pattern: Pattern | None = None
     hue_shift: float = 0.0
     saturation: float = 1.0
     value: float = 1.0
@@ -67,6 +98,8 @@ class Material:
     def __post_init__(self) -> None:
         if self.base_rgb is not None:
             object.__setattr__(self, "base_rgb", _vector("material.base_rgb", self.base_rgb, 0.0, 1.0))
+        elif self.pattern is not None:
+            raise ConfigError("material.pattern: got a pattern without material.base_rgb, expected both")
         _number("material.hue_shift", self.hue_shift, -0.5, 0.5)
         _number("material.saturation", self.saturation, 0.0, 4.0)
         _number("material.value", self.value, 0.0, 4.0)
@@ -136,12 +169,38 @@ class Light:
             raise _fail("light.size_m", self.size_m, "more than 0 for an area light")
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Environment:
+    """A panorama (HDRI) that lights the scene from all around.
+
+    Attributes:
+        path: Picture file, .hdr or .exr, equirectangular.
+        R_cam_env: (3, 3) rotation from the panorama's frame to the camera's: the panorama's x axis points at the middle
+            of the picture, y at the middle of its left half, z up (row 0).
+        strength: Linear radiance that a white surface shows which faces the panorama's average side; the file's own
+            exposure is without effect (see `hdri.load`).
+    """
+
+    path: str
+    R_cam_env: Float[np.ndarray, "3 3"]
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        R = np.array(self.R_cam_env, dtype=np.float64)
+        if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
+            raise ConfigError("environment.R_cam_env: got something else, expected a 3 x 3 rotation matrix")
+        R.setflags(write=False)
+        object.__setattr__(self, "R_cam_env", R)
+        _number("environment.strength", self.strength, 0.0)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Background:
     """What lies behind the rendered objects.
 
     Attributes:
-        kind: 'procedural' (drawn from `seed`) or 'photo' (a crop of the picture at `path`, chosen by `seed`).
+        kind: 'procedural' (drawn from `seed`), 'photo' (a crop of the picture at `path`, chosen by `seed`) or
+            'environment' (what the scene's panorama shows in the camera's direction).
         seed: Seed of the drawing or the crop.
         path: Picture file; only for 'photo'.
     """
@@ -154,7 +213,7 @@ class Background:
         if self.kind not in get_args(BackgroundKind):
             raise _fail("background.kind", self.kind, f"one of {', '.join(get_args(BackgroundKind))}")
         if (self.kind == "photo") != (self.path is not None):
-            raise _fail("background.path", self.path, "a file for kind 'photo' and nothing for 'procedural'")
+            raise _fail("background.path", self.path, "a file for kind 'photo' and nothing for the others")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,6 +263,7 @@ class Scene:
             position in this tuple is the value in `RenderedScene.index`.
         lights: Lamps.
         ambient_rgb: Linear radiance that comes from every direction; it lights objects and is never seen itself.
+        environment: Panorama that adds its light to that of the lamps; None adds nothing.
         background: What is composed behind the objects.
         sensor: Camera effects.
         samples: Light paths per pixel.
@@ -215,6 +275,7 @@ class Scene:
     objects: tuple[SceneObject, ...]
     lights: tuple[Light, ...] = ()
     ambient_rgb: Vector = (0.5, 0.5, 0.5)
+    environment: Environment | None = None
     background: Background = field(default_factory=Background)
     sensor: Sensor = field(default_factory=Sensor)
     samples: int = 8
@@ -231,6 +292,8 @@ class Scene:
         object.__setattr__(self, "objects", tuple(self.objects))
         object.__setattr__(self, "lights", tuple(self.lights))
         object.__setattr__(self, "ambient_rgb", _vector("scene.ambient_rgb", self.ambient_rgb, 0.0))
+        if self.background.kind == "environment" and self.environment is None:
+            raise _fail("scene.background", "environment", "a scene with an environment for this kind of background")
         if self.samples < 1:
             raise _fail("scene.samples", self.samples, "at least 1")
         if not 0 <= self.render_seed < 2**31:

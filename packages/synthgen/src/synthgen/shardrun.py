@@ -1,16 +1,26 @@
 """What a worker process does: whole shards, from a job that is sent once to every worker."""
 
 import threading
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 from posecore import shard
+from posecore.errors import RenderError
 from posecore.mesh import Mesh
 
+from synthgen.assets import Assets
 from synthgen.config import SynthConfig
 from synthgen.pair import PairMaker, concatenate, limit_threads
-from synthgen.target import make_target
+from synthgen.target import make_targets
+
+REPLACEMENT_ATTEMPT = 50
+"""A scene in quarantine is drawn from this attempt on; its manifest line lists it under `quarantined`."""
+
+
+class SceneError(RenderError):
+    """One scene cannot be rendered, which says nothing of the others."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -21,14 +31,14 @@ class ShardJob:
         config: Recipe.
         card: The dataset's card.
         meshes: Objects by id.
-        photos: Background photographs, readable on every worker.
+        assets: Photographs, panoramas and occluder meshes.
         threads: Threads of a Blender engine.
     """
 
     config: SynthConfig
     card: Mapping[str, Any]
     meshes: Mapping[int, Mesh]
-    photos: tuple[str, ...] = ()
+    assets: Assets = field(default_factory=Assets)
     threads: int = 1
 
 
@@ -43,14 +53,42 @@ class ShardRenderer:
         self._job = job
         self._local = threading.local()
 
-    def render(self, shard_id: int) -> shard.Encoded:
-        """Render one shard and encode it for the writer."""
-        maker, config = self._maker(), self._job.config
-        h = config.hypotheses_per_scene
-        count = shard.samples_in(self._job.card, shard_id)
-        first_scene = shard_id * config.shard_size // h
-        scenes = [maker.samples(first_scene + s, min(h, count - s * h)) for s in range(-(-count // h))]
-        return shard.encode(self._job.card, shard_id, concatenate(scenes))
+    def prepare(self) -> None:
+        """Make the engines of this thread, unless they are there.
+
+        Raises:
+            RenderError: One cannot start here.
+        """
+        self._maker()
+
+    def render(self, shard_id: int, quarantined: Collection[int] = ()) -> shard.Encoded:
+        """Render one shard and encode it for the writer.
+
+        Args:
+            shard_id: Which one.
+            quarantined: Scene indices that get another draw than the first acceptable one; the manifest line lists
+                those of this shard.
+
+        Raises:
+            SceneError: The renderer failed at a scene.
+            RenderError: An engine cannot start here.
+            ConfigError: A scene cannot be drawn.
+        """
+        scenes = scenes_in(self._job, shard_id)
+        parts = [self.scene(shard_id, index, quarantined) for index in scenes]
+        encoded = shard.encode(self._job.card, shard_id, concatenate(parts))
+        if replaced := sorted(set(scenes) & set(quarantined)):
+            encoded.line["quarantined"] = replaced
+        return encoded
+
+    def scene(self, shard_id: int, scene_index: int, quarantined: Collection[int] = ()) -> dict[str, np.ndarray]:
+        """Render the samples of one scene of a shard. See `render`."""
+        maker = self._maker()
+        first_attempt = REPLACEMENT_ATTEMPT if scene_index in quarantined else 0
+        try:
+            return maker.samples(scene_index, scenes_in(self._job, shard_id)[scene_index], first_attempt)
+        except RenderError as error:
+            raise SceneError(f"scene {scene_index}: {error}") from error
 
     def close(self) -> None:
         """Free the engines of this thread."""
@@ -63,7 +101,15 @@ class ShardRenderer:
         if not hasattr(self._local, "maker"):
             job = self._job
             limit_threads(job.threads)
-            targets = [make_target(obj_id, mesh, job.config) for obj_id, mesh in sorted(job.meshes.items())]
-            self._local.maker = PairMaker(job.config, targets, job.photos, threads=job.threads)
+            targets = make_targets(job.meshes, job.config, job.assets)
+            self._local.maker = PairMaker(job.config, targets, job.assets, threads=job.threads)
         maker: PairMaker = self._local.maker
         return maker
+
+
+def scenes_in(job: ShardJob, shard_id: int) -> dict[int, int]:
+    """Scenes of a shard in their order, and how many samples of each it holds."""
+    h = job.config.hypotheses_per_scene
+    count = shard.samples_in(job.card, shard_id)
+    first = shard_id * job.config.shard_size // h
+    return {first + s: min(h, count - s * h) for s in range(-(-count // h))}

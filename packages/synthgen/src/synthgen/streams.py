@@ -10,10 +10,15 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What the scenes are for; training pairs and test frames never share a scene."""
+    """What the scenes are for; training pairs, images of different splits and sequences never share a scene."""
 
     PAIRS = 0
     FRAMES = 1
+    VALIDATION_FRAMES = 2
+    TRAINING_FRAMES = 3
+    SEQUENCES = 4
+    VALIDATION_SEQUENCES = 5
+    TRAINING_SEQUENCES = 6
 
 
 class Subject(IntEnum):
@@ -29,6 +34,17 @@ class Subject(IntEnum):
     CONTOUR = 7
     LIBRARY = 8
     RENDER = 9
+    TARGET = 10
+    KIND = 11
+    TABLE = 12
+    ENVIRONMENT = 13
+    VISIBILITY = 14
+    TABLETOPS = 15
+    VIEW = 16
+    SETTING = 17
+    COMPANIONS = 18
+    CAMERA = 19
+    MOTION = 20
 
 
 def stream(seed: int, purpose: Purpose, subject: Subject, *address: int) -> np.random.Generator:

@@ -2,7 +2,8 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +13,18 @@ from posecore.mesh import Mesh
 from posecore.window import fixed_side_px
 from scipy.spatial import ConvexHull, QhullError
 
-from synthgen import occluders
+from synthgen import occluders, tabletop
+from synthgen.assets import Assets
 from synthgen.config import SynthConfig
+from synthgen.rest import Rests
 
 Array = np.ndarray
 
 # A mesh key is an object id below this and a library shape from here on.
 LIBRARY_KEY = 1_000_000
+# Occluder meshes in their own size are the same for all objects: their keys lie below this, and tables' far below.
+OCCLUDER_KEY = -1000
+_CUTOUT_REACH_DIAMETER = 4.0  # how far behind the object its props reach in a cutout scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,6 +39,8 @@ class Target:
         distance_m: Nearest and farthest camera z of the box centre.
         window_side_px: Side of its fixed window in full-image pixels.
         shapes: Occluder meshes by mesh key.
+        tables: Table meshes by mesh key; none where no scene has a table.
+        reach_m: How far behind the object's centre a scene may reach.
     """
 
     obj_id: int
@@ -42,6 +50,21 @@ class Target:
     distance_m: tuple[float, float]
     window_side_px: float
     shapes: Mapping[int, Mesh]
+    tables: Mapping[int, Mesh]
+    reach_m: float
+
+    @cached_property
+    def rests(self) -> Rests:
+        """Stable poses of the object and its occluder shapes by mesh key."""
+        return Rests({self.obj_id: self.mesh, **self.shapes})
+
+    @cached_property
+    def mean_rgb(self) -> Float[Array, "3"]:
+        """Mean display colour of the surface, in [0, 1], faces weighted by their area."""
+        corners = self.mesh.vertices_m[self.mesh.faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        colours = self.mesh.colours[self.mesh.faces].mean(axis=1) / 255.0
+        return np.asarray((colours * area[:, None]).sum(axis=0) / max(float(area.sum()), 1e-12))
 
 
 def object_ids(paths: Sequence[str]) -> list[int]:
@@ -60,8 +83,21 @@ def object_ids(paths: Sequence[str]) -> list[int]:
     return ids
 
 
-def make_target(obj_id: int, mesh: Mesh, config: SynthConfig) -> Target:
-    """Prepare an object: its hull, distances, window and occluder shapes.
+def make_targets(meshes: Mapping[int, Mesh], config: SynthConfig, assets: Assets | None = None) -> list[Target]:
+    """Prepare objects, sorted by id; `window.shared` gives all of them the largest one's window.
+
+    Raises:
+        ConfigError: The distance range does not suit an object's size.
+    """
+    targets = [make_target(obj_id, mesh, config, assets) for obj_id, mesh in sorted(meshes.items())]
+    if config.window.shared:
+        side_px = max(t.window_side_px for t in targets)
+        targets = [replace(t, window_side_px=side_px) for t in targets]
+    return targets
+
+
+def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | None = None) -> Target:
+    """Prepare one object: its hull, distances, window, occluder shapes and tables.
 
     Raises:
         ConfigError: The distance range does not suit the object's size.
@@ -74,8 +110,13 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig) -> Target:
     camera = config.camera.camera()
     centred = hull_m - mesh.center_m
     side_px = fixed_side_px(centred, camera.K, distance_m[0], config.window.padding)
-    first_key = LIBRARY_KEY + obj_id * config.occluders.library
-    shapes = occluders.library(config.occluders, config.seed, obj_id, mesh.diameter_m)
+    assets = assets or Assets()
+    shapes = _shapes(obj_id, mesh, config, assets)
+    tables: dict[int, Mesh] = {}
+    reach_m = max(_CUTOUT_REACH_DIAMETER * mesh.diameter_m, 2.5 * mesh.diameter_m + _largest_m(shapes))
+    if config.scene.kind != "cutout":
+        tables = tabletop.tables(config.tabletop, config.seed, mesh.diameter_m, assets.photos)
+        reach_m = max(reach_m, tabletop.reach_diameter(config.tabletop) * mesh.diameter_m)
     return Target(
         obj_id=obj_id,
         name=Path(mesh.path).name,
@@ -83,5 +124,20 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig) -> Target:
         hull_m=hull_m,
         distance_m=distance_m,
         window_side_px=side_px,
-        shapes={first_key + i: shape for i, shape in enumerate(shapes)},
+        shapes=shapes,
+        tables=tables,
+        reach_m=reach_m,
     )
+
+
+def _shapes(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets) -> dict[int, Mesh]:
+    if assets.occluders and config.occluders.scale == "own":
+        return {OCCLUDER_KEY - i: shape for i, shape in enumerate(assets.occluders[: config.occluders.library])}
+    recipe = (config.occluders, config.seed, obj_id, mesh.diameter_m)
+    shapes = occluders.fitted(*recipe, assets.occluders) if assets.occluders else occluders.library(*recipe)
+    first_key = LIBRARY_KEY + obj_id * config.occluders.library
+    return {first_key + i: shape for i, shape in enumerate(shapes)}
+
+
+def _largest_m(shapes: Mapping[int, Mesh]) -> float:
+    return max((shape.diameter_m for shape in shapes.values()), default=0.0)

@@ -1,10 +1,7 @@
 """The Blender engine: plain scenes in, layers out."""
 
-import shutil
-import tempfile
 import weakref
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -20,19 +17,20 @@ except ImportError as error:
         "it names, or use the engine raster"
     ) from error
 
+from synthgen import scratch
 from synthgen.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_of, occupied_region
 from synthgen.blender.exr import read_channels
-from synthgen.blender.lights import Ambient, Lamps
+from synthgen.blender.lights import Lamps, World
 from synthgen.blender.materials import INDEX_AOV
 from synthgen.blender.objects import Props
 from synthgen.blender.quiet import blender_output_caught
 from synthgen.blender.settings import ENGINE_IDS, set_common, set_cycles, set_eevee
 from synthgen.engine import Device, RenderedScene
+from synthgen.hdri import with_lamps, with_suns
 from synthgen.scene import Scene
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
-SHARED_MEMORY = Path("/dev/shm")
 CLIP_RANGE_M = (NEAREST_M, 100.0)
 INDEX_CHANNELS = {"cycles": "IndexOB.X", "eevee": f"{INDEX_AOV}.X"}
 
@@ -47,7 +45,7 @@ class BlenderEngine:
     Args:
         name: 'cycles' or 'eevee'.
         threads: Threads to render with, 0 for all cores. The result is the same for any number.
-        device: 'cpu' or 'gpu', where Cycles traces.
+        device: Where Cycles traces; 'auto' takes OptiX, CUDA or the CPU, whichever is there first.
 
     Raises:
         ConfigError: Another name.
@@ -72,11 +70,11 @@ class BlenderEngine:
         self._scene.camera = self._camera
         self._props = Props(self._scene.collection)
         self._lamps = Lamps(self._scene.collection)
-        self._ambient = Ambient(self._scene)
+        self._world = World(self._scene)
         # In memory: a write to a disk costs more than a render of few samples.
-        folder = tempfile.mkdtemp(dir=SHARED_MEMORY if SHARED_MEMORY.is_dir() else None, prefix="synthgen_")
-        self._remove_folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        self._file = Path(folder) / "layers.exr"
+        folder, remove_folder = scratch.make_folder()
+        self._remove_folder = weakref.finalize(self, remove_folder)
+        self._file = folder / "layers.exr"
         self._scene.render.filepath = str(self._file)
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
@@ -93,9 +91,11 @@ class BlenderEngine:
         Raises:
             RenderError: A mesh key is unknown or Blender failed.
         """
+        # EEVEE's light from a world casts no shadow.
+        scene = with_suns(scene) if self.name == "cycles" else with_lamps(scene)
         self._props.set(scene.objects)
         self._lamps.set(scene.lights)
-        self._ambient.set(scene.ambient_rgb)
+        self._world.set(scene.ambient_rgb, scene.environment)
         occupied = occupied_region(scene.camera, scene.region_px, self._props.corners(scene.objects))
         layers = _empty(scene.region_px)
         if occupied is None:
@@ -122,7 +122,8 @@ class BlenderEngine:
         self._remove_folder()
         self._props.remove()
         self._lamps.remove()
-        bpy.data.batch_remove([self._camera.data, self._scene.world])
+        self._world.remove()
+        bpy.data.cameras.remove(self._camera.data)
         bpy.data.scenes.remove(self._scene)
 
     def _point_camera(self, camera: Camera, region_px: Region) -> None:

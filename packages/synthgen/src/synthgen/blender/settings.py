@@ -1,13 +1,14 @@
 """Render settings of Cycles and EEVEE for small pictures: everything that costs time per picture is off."""
 
 import bpy
-from posecore.errors import RenderError
 
+from synthgen.blender.devices import gpu_counts, use_gpus
 from synthgen.blender.materials import INDEX_AOV
+from synthgen.devices import choose_device
+from synthgen.engine import Device
 
 ENGINE_IDS = {"cycles": "CYCLES", "eevee": "BLENDER_EEVEE_NEXT"}
 COLOUR_FILTER_PX = 1.5
-GPU_KINDS = ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI")
 
 
 def set_common(scene: bpy.types.Scene, *, engine: str, threads: int) -> None:
@@ -44,22 +45,22 @@ def set_common(scene: bpy.types.Scene, *, engine: str, threads: int) -> None:
     scene.view_layers[0].use_pass_z = True
 
 
-def set_cycles(scene: bpy.types.Scene, *, device: str) -> None:
+def set_cycles(scene: bpy.types.Scene, *, device: Device) -> None:
     """Set Cycles to few samples and short paths, with the same result on any number of threads.
 
     Args:
         scene: Blender's scene.
-        device: 'cpu' or 'gpu'.
+        device: Where to trace; 'auto' takes the first of OptiX, CUDA and the CPU that is there.
 
     Raises:
-        RenderError: 'gpu' and Cycles finds none.
+        RenderError: Cycles finds no such device.
     """
     scene.view_layers[0].use_pass_object_index = True
     cycles = scene.cycles
-    cycles.device = "CPU"
-    if device == "gpu":
-        _use_gpu()
-        cycles.device = "GPU"
+    chosen = "cpu" if device == "cpu" else choose_device(device, gpu_counts())
+    cycles.device = "CPU" if chosen == "cpu" else "GPU"
+    if chosen != "cpu":
+        use_gpus(chosen)
     # Samples are few and equal everywhere: an adaptive or denoised pixel costs more here than another sample.
     cycles.use_adaptive_sampling = False
     cycles.use_denoising = False
@@ -94,18 +95,3 @@ def set_eevee(scene: bpy.types.Scene) -> None:
     scene.eevee.use_taa_reprojection = False
     variable = scene.view_layers[0].aovs.add()
     variable.name, variable.type = INDEX_AOV, "VALUE"
-
-
-def _use_gpu() -> None:
-    preferences = bpy.context.preferences.addons["cycles"].preferences
-    for kind in GPU_KINDS:
-        try:
-            devices = preferences.get_devices_for_type(kind)
-        except (TypeError, ValueError):  # a kind that this build of Blender does not know
-            continue
-        if any(device.type == kind for device in devices):
-            preferences.compute_device_type = kind
-            for device in devices:
-                device.use = device.type == kind
-            return
-    raise RenderError(f"device gpu: Cycles finds no device of {', '.join(GPU_KINDS)}; use the device cpu")

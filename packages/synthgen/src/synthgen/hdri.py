@@ -1,0 +1,244 @@
+"""Panoramas (HDRIs): read, brought to one exposure, seen from a camera, and simplified to lamps."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import OpenEXR
+from jaxtyping import Float, UInt8
+from posecore.errors import ConfigError
+
+from synthgen.scene import Background, Environment, Light, Scene
+from synthgen.sensor import display_from_linear
+
+Array = np.ndarray
+
+SUFFIXES = (".hdr", ".exr")
+LIGHT_SIZE_PX = (512, 256)  # what lights a scene: finer only costs time, and a renderer's importance map is no finer
+VIEW_WIDTH_PX = 2048  # what is seen behind a scene
+IN_MEMORY = 8  # panoramas kept decoded; one is at most 14 MB
+_CUT_LEVEL = 2.0
+_MOST_SUNS = 8
+_TOO_LITTLE = 0.01  # of the panorama's light
+_SUN_RADIUS_RAD = math.radians(15.0)
+_SMALLEST_SUN_RAD = 0.01
+_ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panorama:
+    """A decoded panorama at unit level; row 0 is straight up, columns go round to the right as seen from inside.
+
+    Attributes:
+        light: (256, 512, 3) linear radiance.
+        view: (h, w, 3) the same in half precision and finer.
+    """
+
+    light: Float[Array, "256 512 3"]
+    view: Float[Array, "h w 3"]
+
+
+def list_hdris(folder: str | Path) -> tuple[str, ...]:
+    """Panoramas of a folder, sorted by name, subfolders included, every one decoded once.
+
+    Raises:
+        ConfigError: The folder is missing, holds no panorama, or one does not decode; the message names it.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise ConfigError(f"--hdris {folder}: no such folder; give a folder with .hdr or .exr panoramas")
+    found = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in SUFFIXES))
+    if not found:
+        raise ConfigError(f"--hdris {folder}: no panorama in it, expected {' or '.join(SUFFIXES)} files")
+    for path in found:
+        _decode(path)
+    return found
+
+
+@lru_cache(maxsize=IN_MEMORY)
+def load(path: str) -> Panorama:
+    """Read a panorama and scale it to unit level.
+
+    At unit level a white matt surface shows radiance 1 in the mean of two places: facing straight up, and facing every
+    direction in turn. That depends on no turn about the vertical, and neither a sun nor an overcast sky is left dark.
+
+    Raises:
+        ConfigError: The file does not decode.
+    """
+    image = _decode(path)
+    width = min(image.shape[1], VIEW_WIDTH_PX)
+    view = cv2.resize(image, (width, width // 2), interpolation=cv2.INTER_AREA)
+    light = cv2.resize(image, LIGHT_SIZE_PX, interpolation=cv2.INTER_AREA)
+    directions, weights = _sphere(*LIGHT_SIZE_PX)
+    luminance = light.mean(axis=2) * weights
+    facing_up = float((luminance * np.maximum(directions[..., 2], 0.0)).sum() / math.pi)
+    level = max(0.5 * facing_up + 0.5 * float(luminance.sum() / (4 * math.pi)), 1e-9)
+    return Panorama(
+        light=(light / np.float32(level)).astype(np.float32),
+        view=np.minimum(view / np.float32(level), np.float32(6e4)).astype(np.float16),
+    )
+
+
+def crop(
+    environment: Environment, K: Float[Array, "3 3"], region_px: tuple[int, int, int, int]
+) -> UInt8[Array, "h w 3"]:
+    """What a camera sees of the panorama in a region of its pixels, display colours.
+
+    Args:
+        environment: Panorama with its turn.
+        K: Camera matrix.
+        region_px: (x0, y0, width, height).
+    """
+    x0, y0, width, height = region_px
+    rays = np.empty((height, width, 3), np.float32)
+    rays[..., 0] = ((x0 + np.arange(width) + 0.5 - K[0, 2]) / K[0, 0])[None, :]
+    rays[..., 1] = ((y0 + np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
+    rays[..., 2] = 1.0
+    x, y, z = np.moveaxis(rays @ environment.R_cam_env.astype(np.float32), -1, 0)  # row vectors: the inverse turn
+    view = load(environment.path).view
+    rows, columns = view.shape[:2]
+    # one column is repeated on either side, so that interpolation goes on across the seam
+    padded = np.concatenate([view[:, -1:], view, view[:, :1]], axis=1).astype(np.float32)
+    u = (0.5 - np.arctan2(y, x) / np.float32(2 * np.pi)) * columns
+    v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi)) * rows
+    seen = cv2.remap(
+        padded,
+        (u + 0.5).astype(np.float32),
+        (v - 0.5).astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    display = display_from_linear(seen * np.float32(environment.strength))
+    return np.asarray((display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Split:
+    """A panorama's light in two: small bright places as suns, and what is left, which no renderer finds noisy.
+
+    Attributes:
+        rest: (256, 512, 3) linear radiance without the suns' share.
+        ambient: (3,) its mean over all directions.
+        suns: Direction towards it in the panorama's frame, irradiance of each channel, and the angle it subtends, rad.
+    """
+
+    rest: Float[Array, "256 512 3"]
+    ambient: Float[Array, "3"]
+    suns: tuple[tuple[Float[Array, "3"], Float[Array, "3"], float], ...]
+
+
+@lru_cache(maxsize=IN_MEMORY)
+def split(path: str) -> Split:
+    """Split a panorama at unit level; irradiance summed over all directions stays what it was.
+
+    Radiance above a level of 2 is cut off. The brightest places get the light that was cut off around them, as suns of
+    their size; what is then left of it is spread over its surroundings.
+
+    Raises:
+        ConfigError: The file does not decode.
+    """
+    light = load(path).light
+    directions, weights = _sphere(*LIGHT_SIZE_PX)
+    kept = light * np.minimum(1.0, _CUT_LEVEL / np.maximum(light.mean(axis=2, keepdims=True), 1e-9))
+    cut = (light - kept) * weights[..., None]
+    energy, total = cut.mean(axis=2), float((light.mean(axis=2) * weights).sum())
+    suns: list[tuple[Float[Array, "3"], Float[Array, "3"], float]] = []
+    while len(suns) < _MOST_SUNS and energy.max() > 0.0 and energy.sum() > _TOO_LITTLE * total:
+        peak = directions[np.unravel_index(energy.argmax(), energy.shape)]
+        here = (directions @ peak > math.cos(_SUN_RADIUS_RAD)) & (energy > 0.0)
+        towards = (energy[here][:, None] * directions[here]).sum(axis=0)
+        towards /= np.linalg.norm(towards)
+        angle = np.arccos(np.clip(directions[here] @ towards, -1.0, 1.0))
+        spread = math.sqrt(float((energy[here] * angle**2).sum() / energy[here].sum()))
+        suns.append((towards, cut[here].sum(axis=0).astype(np.float64), max(2.0 * spread, _SMALLEST_SUN_RAD)))
+        cut[here], energy[here] = 0.0, 0.0
+    rest = kept + _spread(cut, weights)
+    ambient = (rest * weights[..., None]).sum(axis=(0, 1)) / (4 * math.pi)
+    return Split(rest=rest.astype(np.float32), ambient=ambient.astype(np.float64), suns=tuple(suns))
+
+
+def _spread(cut: Float[Array, "h w 3"], weights: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """Radiance of light (radiance times solid angle) that is blurred by about 20 degrees; none is lost."""
+    around = cut.shape[1] // 2
+    padded = np.concatenate([cut[:, -around:], cut, cut[:, :around]], axis=1)  # the columns go round
+    blurred = cv2.GaussianBlur(padded, (0, 0), cut.shape[1] / 18, borderType=cv2.BORDER_REFLECT)[:, around:-around]
+    solid_angle = cv2.GaussianBlur(weights, (0, 0), cut.shape[1] / 18, borderType=cv2.BORDER_REFLECT)
+    radiance = blurred / solid_angle[..., None]
+    light = np.maximum((radiance * weights[..., None]).sum(axis=(0, 1)), 1e-12)
+    return np.asarray((radiance * (cut.sum(axis=(0, 1)) / light)).astype(np.float32))
+
+
+def with_suns(scene: Scene) -> Scene:
+    """The scene with the suns of its panorama among its lamps; the panorama is then to light with `Split.rest` only."""
+    if scene.environment is None:
+        return scene
+    environment = scene.environment
+    suns = []
+    for towards, irradiance, size_rad in split(environment.path).suns:
+        x, y, z = (environment.R_cam_env @ towards).tolist()
+        brightest = float(irradiance.max())
+        r, g, b = (irradiance / brightest).tolist()
+        suns.append(
+            Light(
+                kind="sun",
+                direction_cam=(x, y, z),
+                rgb=(r, g, b),
+                strength=brightest * environment.strength,
+                size_m=size_rad,
+            )
+        )
+    return replace(scene, lights=(*scene.lights, *suns))
+
+
+def with_lamps(scene: Scene) -> Scene:
+    """The scene with its panorama replaced by suns and even light, for engines that know lamps only.
+
+    A background that shows the panorama is replaced too: this scene is for its light.
+    """
+    if scene.environment is None:
+        return scene
+    ambient = split(scene.environment.path).ambient * scene.environment.strength
+    r, g, b = (np.array(scene.ambient_rgb) + ambient).tolist()
+    return replace(with_suns(scene), ambient_rgb=(r, g, b), environment=None, background=Background())
+
+
+@lru_cache(maxsize=4)
+def _sphere(width_px: int, height_px: int) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """Direction and solid angle of every pixel of a panorama, in the panorama's frame."""
+    azimuth = (0.5 - (np.arange(width_px) + 0.5) / width_px) * 2 * np.pi
+    elevation = (0.5 - (np.arange(height_px) + 0.5) / height_px) * np.pi
+    e, a = np.meshgrid(elevation, azimuth, indexing="ij")
+    directions = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=-1)
+    weights = np.cos(e)
+    return directions, weights * (4 * np.pi / weights.sum())
+
+
+def _decode(path: str) -> Float[Array, "h w 3"]:
+    image = _read_exr(path) if path.lower().endswith(".exr") else cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    if image is None or image.ndim != 3 or image.shape[2] < 3 or image.dtype != np.float32:
+        raise ConfigError(
+            f"{path}: does not decode as an HDRI, expected a panorama in {' or '.join(SUFFIXES)}; "
+            "export it again or take it out of the --hdris folder"
+        )
+    height, width = image.shape[:2]
+    if height < 2 or abs(width / height - 2.0) > _ASPECT_TOLERANCE:
+        raise ConfigError(
+            f"{path}: the picture is {width} x {height} px, expected an equirectangular panorama, twice as wide as "
+            "high; take it out of the --hdris folder"
+        )
+    rgb = image[..., :3] if path.lower().endswith(".exr") else image[..., 2::-1]
+    return np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=6e4, neginf=0.0), 0.0).astype(np.float32)
+
+
+def _read_exr(path: str) -> Float[Array, "h w 3"] | None:
+    try:
+        with OpenEXR.File(path, separate_channels=True) as file:
+            channels = {name.split(".")[-1]: np.asarray(c.pixels, np.float32) for name, c in file.channels().items()}
+    except (RuntimeError, OSError, ValueError):
+        return None
+    if not {"R", "G", "B"} <= channels.keys():
+        return None
+    return np.stack([channels[name] for name in "RGB"], axis=-1)
