@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from posecore.mesh import load_mesh
 from synthgen.config import load_config
+from synthgen.draw.target import make_target
 from synthgen.engine import RenderedScene
+from synthgen.image.sensor import display_from_linear
 from synthgen.pair import PairMaker, limit_threads
 from synthgen.scene import Scene
-from synthgen.sensor import display_from_linear
-from synthgen.target import make_target
 
 REFERENCE_SAMPLES = 512
 DENOISERS = {"none": None, "fast": "FAST", "high": "HIGH"}

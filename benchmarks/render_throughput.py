@@ -31,8 +31,8 @@ from posecore.camera import Camera
 from posecore.mesh import Mesh, load_mesh
 from synthgen import dataset
 from synthgen.config import SynthConfig, load_config
+from synthgen.draw.target import make_target
 from synthgen.pair import PairMaker, concatenate, limit_threads
-from synthgen.target import make_target
 
 Fields = dict[str, Any]
 

@@ -23,10 +23,10 @@ from posecore.mesh import load_mesh
 from posecore.shard import Field, ShardReader, ShardWriter, field_table, files
 from synthgen import dataset
 from synthgen.assets import Assets
-from synthgen.background import list_photos
 from synthgen.config import load_config
+from synthgen.draw.target import make_targets
+from synthgen.image.background import list_photos
 from synthgen.pair import PairMaker, concatenate, limit_threads
-from synthgen.target import make_targets
 
 Array = np.ndarray
 SHARD = 64

@@ -9,7 +9,7 @@ from posecore.shard import ShardWriter
 from synthgen import dataset
 from synthgen.assets import Assets
 from synthgen.config import SynthConfig
-from synthgen.shardrun import ShardJob, ShardRenderer
+from synthgen.run.shardrun import ShardJob, ShardRenderer
 
 
 def write_dataset(

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from posecore.mesh import Mesh, load_mesh
 from synthgen.config import SynthConfig, load_config
+from synthgen.draw.target import Target, make_target
 from synthgen.pair import PairMaker
-from synthgen.target import Target, make_target
 
 SMALL = (
     "engine=raster",

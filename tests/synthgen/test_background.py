@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from posecore.errors import ConfigError
-from synthgen import background
+from synthgen.image import background
 from synthgen.scene import Background
 
 

@@ -15,11 +15,12 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
-from synthgen import bopset, lock
 from synthgen.assets import Assets
-from synthgen.bopset import write_dataset
+from synthgen.bop import bopset
+from synthgen.bop.bopset import write_dataset
+from synthgen.bop.framemaker import FramePlan
 from synthgen.config import load_config
-from synthgen.framemaker import FramePlan
+from synthgen.run import lock
 
 SMALL_CAMERA = tuple(
     f"camera.{key}={value}"
@@ -182,9 +183,9 @@ def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, 
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "from posecore.mesh import load_mesh\n"
-        "from synthgen.bopset import write_dataset\n"
+        "from synthgen.bop.bopset import write_dataset\n"
         "from synthgen.config import load_config\n"
-        "from synthgen.framemaker import FramePlan\n"
+        "from synthgen.bop.framemaker import FramePlan\n"
         "from conftest import SMALL\n"
         "from test_bopset import MANY\n"
         "meshes = {1: load_mesh(sys.argv[3]), 4: load_mesh(sys.argv[4])}\n"
@@ -286,7 +287,7 @@ def test_the_pbr_preset_shows_many_objects_on_a_table(tmp_path, meshes):
 
 
 def test_depth_steps_grow_for_far_scenes(config_of, meshes):
-    from synthgen.target import make_targets
+    from synthgen.draw.target import make_targets
 
     for overrides, scale in (((), 0.1), (("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0)):
         config = config_of(*overrides)

@@ -9,7 +9,7 @@ from posecore.mesh import Mesh
 from synthgen import dataset
 from synthgen.assets import Assets
 from synthgen.config import load_config
-from synthgen.target import object_ids
+from synthgen.draw.target import object_ids
 
 
 def test_the_card_tells_everything_but_time_and_place(config_of, tug):

@@ -7,11 +7,12 @@ import sys
 import pytest
 from click.testing import CliRunner
 from posecore.errors import RenderError
-from synthgen import cluster, devices
+from synthgen import devices
 from synthgen.cli import main
 from synthgen.config import load_config
-from synthgen.shardrun import ShardJob
-from synthgen.worker import RendererPlugin
+from synthgen.run import cluster
+from synthgen.run.shardrun import ShardJob
+from synthgen.run.worker import RendererPlugin
 
 
 def test_auto_takes_the_fastest_that_is_there():

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from synthgen import doctor, machine
+from synthgen import machine
 from synthgen.cli import main
-from synthgen.speed import Speed
+from synthgen.inspect import doctor
+from synthgen.inspect.speed import Speed
 
 MISSING_LIBRARY = "raise ImportError('libXi.so.6: cannot open shared object file: No such file or directory')"
 

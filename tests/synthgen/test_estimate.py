@@ -5,9 +5,10 @@ from posecore.errors import PoseError, StorageError
 from posecore.mesh import load_mesh
 from posecore.shard import ShardReader
 from small_datasets import write_dataset
-from synthgen import dataset, estimate
+from synthgen import dataset
 from synthgen.assets import Assets
-from synthgen.shardrun import ShardJob
+from synthgen.run import estimate
+from synthgen.run.shardrun import ShardJob
 
 
 @pytest.fixture

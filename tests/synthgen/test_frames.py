@@ -5,11 +5,11 @@ import pytest
 from posecore import se3
 from posecore.camera import project
 from posecore.mesh import load_mesh
-from synthgen import sampling
 from synthgen.assets import Assets
-from synthgen.frames import Balls, ceiling_lights, clearance_m, draw_camera, draw_layout, level_view
-from synthgen.streams import Purpose
-from synthgen.target import make_targets
+from synthgen.bop.frames import Balls, ceiling_lights, clearance_m, draw_camera, draw_layout, level_view
+from synthgen.draw import sampling
+from synthgen.draw.streams import Purpose
+from synthgen.draw.target import make_targets
 
 
 @pytest.fixture(scope="module")

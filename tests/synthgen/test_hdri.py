@@ -10,8 +10,8 @@ from posecore.camera import Camera, intrinsics
 from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 from posecore.se3 import random_rotation, rotation_from_rotvec
-from synthgen import background, hdri
 from synthgen.engines import make_engine
+from synthgen.image import background, hdri
 from synthgen.scene import Background, Environment, SceneObject
 
 WIDE = Camera(K=intrinsics(20.0, 20.0, 32.0, 32.0), width_px=64, height_px=64)  # 116 degrees: it sees well to the sides

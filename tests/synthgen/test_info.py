@@ -10,7 +10,7 @@ from posecore.shard import ShardReader
 from small_datasets import write_dataset
 from synthgen.cli import main
 from synthgen.config import load_config
-from synthgen.info import changed_keys, dataset_info
+from synthgen.inspect.info import changed_keys, dataset_info
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from posecore.errors import StorageError
-from synthgen import lock, scratch
+from synthgen.run import lock, scratch
 
 
 def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):

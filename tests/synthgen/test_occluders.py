@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from blender_scenes import box
 from posecore.errors import ConfigError
-from synthgen import occluders, sampling
 from synthgen.assets import Assets
 from synthgen.config import OccluderConfig
-from synthgen.streams import Purpose, Subject, stream
-from synthgen.target import make_target
+from synthgen.draw import occluders, sampling
+from synthgen.draw.streams import Purpose, Subject, stream
+from synthgen.draw.target import make_target
 
 
 def test_shapes_have_the_asked_sizes_and_repeat():
@@ -70,7 +70,7 @@ def test_a_wanted_visible_share_is_met(maker_of):
     )
     seen, wanted = [], []
     for i in range(60):
-        draw, attempt = maker.accepted_scene(Purpose.PAIRS, i)
+        draw, attempt = maker.accepted_scene(i)
         wanted.append(stream(0, Purpose.PAIRS, Subject.VISIBILITY, i, attempt).uniform(0.3, 0.9))
         seen.append(maker._visible(sampling.target_box(draw.target, maker.camera, draw.T_cam_obj), draw))
     off = np.abs(np.array(seen) - wanted)
@@ -81,7 +81,7 @@ def test_a_wanted_visible_share_is_met(maker_of):
 
 def test_without_front_shapes_nothing_is_slid_in(maker_of):
     maker = maker_of("occluders.visible_fraction=[0.4, 0.5]", "occluders.front=[0, 0]", "occluders.props=[0, 0]")
-    assert maker.accepted_scene(Purpose.PAIRS, 0)[0].front == ()
+    assert maker.accepted_scene(0)[0].front == ()
 
 
 def test_meshes_are_scaled_to_the_object_or_left_alone(tug, config_of):

@@ -11,7 +11,7 @@ from posecore.mesh import load_mesh
 from posecore.shard import ShardReader, ShardWriter
 from small_datasets import write_dataset
 from synthgen.cli import main
-from synthgen.only import reproduce
+from synthgen.inspect.only import reproduce
 
 N = 9  # shards of 4, 4 and 1; two hypotheses on a scene, one on the last
 REPLACED = 2  # a scene that is rendered as if it had crashed the renderer

@@ -7,7 +7,6 @@ from posecore.se3 import apply, inverse
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, field_table
 from posecore.window import Window, silhouette_box
 from synthgen.pair import concatenate
-from synthgen.streams import Purpose
 
 PLAIN = ("occluders.front=[0, 0]", "occluders.props=[0, 0]")
 SHARP = (
@@ -73,7 +72,7 @@ def test_the_picture_shows_the_object_inside_its_contour(maker_of, patch_px):
     object_on_black = []
     for scene_index in range(4):
         s = maker.samples(scene_index)
-        draw, _ = maker.accepted_scene(Purpose.PAIRS, scene_index)
+        draw, _ = maker.accepted_scene(scene_index)
         shot = maker._shoot(draw, [Window(x0_px=x, y0_px=y, side_px=w) for x, y, w in s["window_px"]])
         for i in range(2):
             from posecore.window import cut

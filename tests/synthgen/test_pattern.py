@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from blender_scenes import at, quad, scene_of
 from posecore.camera import back_project
-from synthgen import pattern
 from synthgen.engines import make_engine
+from synthgen.image import pattern
+from synthgen.image.sensor import linear_from_display
 from synthgen.scene import Material, Pattern, SceneObject
-from synthgen.sensor import linear_from_display
 
 PATTERN = Pattern(accent_rgb=(0.0, 0.0, 1.0), wave=(90.0, 20.0, 0.0), warp=(0.0, 60.0, 0.0), bend=2.0, sharpness=3.0)
 LOOK = Material(base_rgb=(1.0, 0.5, 0.0), pattern=PATTERN, roughness=1.0, specular=0.0)

@@ -13,8 +13,8 @@ import psutil
 import pytest
 from distributed import Client
 from posecore.shard import Encoded, ShardReader, ShardWriter, field_table
-from synthgen import cluster, pipeline, worker
-from synthgen.shardrun import ShardJob, ShardRenderer
+from synthgen.run import cluster, pipeline, worker
+from synthgen.run.shardrun import ShardJob, ShardRenderer
 
 
 def command(tug_ply, out, small_set, *extra):
@@ -115,7 +115,13 @@ def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set)
 
 def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set):
     arguments = command(tug_ply, tmp_path / "shards", small_set, "--n", "4000", "--workers", "1")
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        arguments,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job inherits it ignored
+    )
     started = time.monotonic()
     # until the workers run, the signal is ignored
     while not (tmp_path / "shards" / "manifest.jsonl").exists() and time.monotonic() - started < 180:

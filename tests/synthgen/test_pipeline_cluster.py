@@ -5,17 +5,18 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
 from click.testing import CliRunner
-from synthgen import cluster as dask_cluster
-from synthgen import worker
 from synthgen.assets import Assets
 from synthgen.cli import main
-from synthgen.shardrun import ShardJob
+from synthgen.run import cluster as dask_cluster
+from synthgen.run import worker
+from synthgen.run.shardrun import ShardJob
 
 N = "46"
 
@@ -37,6 +38,18 @@ def error_line(result):
     assert len(lines) == 1, result.stderr
     assert "Traceback" not in result.stderr
     return lines[0]
+
+
+def kill(process):
+    """End a process and what it started."""
+    try:
+        family = [*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)]
+    except psutil.NoSuchProcess:  # it has ended, and was waited for
+        return
+    for member in family:
+        with suppress(psutil.NoSuchProcess):
+            member.kill()
+    process.wait(timeout=60)
 
 
 class Cluster:
@@ -70,9 +83,7 @@ class Cluster:
 
     def close(self):
         for process in self.processes:
-            process.terminate()  # workers are told, and end with their nanny
-        for process in self.processes:
-            process.wait(timeout=60)
+            kill(process)
 
 
 @pytest.fixture
@@ -145,8 +156,7 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
         result = subprocess.run(arguments, capture_output=True, text=True, timeout=100, check=False)
         for word in words:
             assert word in error_line(result)
-        process.terminate()
-        process.wait(timeout=60)
+        kill(process)
 
 
 def test_a_worker_says_why_it_cannot_render(tug, config_of):

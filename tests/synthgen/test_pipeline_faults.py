@@ -16,11 +16,12 @@ import numpy as np
 import pytest
 from posecore.errors import RenderError
 from posecore.shard import ShardReader, ShardWriter
-from synthgen import dataset, pipeline, scratch
+from synthgen import dataset
 from synthgen.assets import Assets
 from synthgen.pair import concatenate
-from synthgen.shardrun import REPLACEMENT_ATTEMPT, ShardJob, ShardRenderer
-from synthgen.worker import RendererPlugin
+from synthgen.run import pipeline, scratch
+from synthgen.run.shardrun import REPLACEMENT_ATTEMPT, ShardJob, ShardRenderer
+from synthgen.run.worker import RendererPlugin
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import a test module
 

@@ -7,9 +7,9 @@ from posecore.errors import RenderError
 from posecore.se3 import make_T
 from synthgen.engine import Engine
 from synthgen.engines import make_engine
+from synthgen.image.sensor import display_from_linear
 from synthgen.raster_engine import RasterEngine
 from synthgen.scene import Light, Material, Scene, SceneObject
-from synthgen.sensor import display_from_linear
 
 CAMERA = Camera(K=intrinsics(300.0, 310.0, 81.5, 58.0), width_px=160, height_px=120)
 

@@ -3,9 +3,9 @@ import pytest
 from blender_scenes import box, quad
 from posecore.mesh import Mesh
 from scipy.spatial import ConvexHull
-from synthgen import occluders
 from synthgen.config import OccluderConfig
-from synthgen.rest import find_rest
+from synthgen.draw import occluders
+from synthgen.draw.rest import find_rest
 
 
 def test_a_cube_rests_on_each_face_equally_often():

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from posecore.se3 import rotation_angle_rad
-from synthgen import sampling
 from synthgen.assets import Assets
-from synthgen.streams import Purpose, Subject, stream
+from synthgen.draw import sampling
+from synthgen.draw.streams import Purpose, Subject, stream
 
 
 def draw(config, target, index, attempt=0, purpose=Purpose.PAIRS):

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
-from synthgen import sensor
-from synthgen.compose import compose
 from synthgen.engine import RenderedScene
+from synthgen.image import sensor
+from synthgen.image.compose import compose
 from synthgen.scene import Background, Sensor
 
 
@@ -52,11 +52,13 @@ def test_jpeg_keeps_the_channels_in_order():
 
 
 def test_compose_puts_the_background_behind(config_of, tug_target):
-    from synthgen import background, sampling
-    from synthgen.streams import Purpose
+    from synthgen.assets import Assets
+    from synthgen.draw import sampling
+    from synthgen.draw.streams import Purpose
+    from synthgen.image import background
 
     config = config_of()
-    draw = sampling.draw_scene(config, [tug_target], (), Purpose.PAIRS, 0, 0)
+    draw = sampling.draw_scene(config, [tug_target], Assets(), Purpose.PAIRS, 0, 0)
     scene = draw.scene(config.camera.camera(), (0, 0, 16, 8), 1)
     scene = type(scene)(**{**vars(scene), "sensor": Sensor(), "background": Background(seed=3)})
     alpha = np.zeros((8, 16), np.float32)

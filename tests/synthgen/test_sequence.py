@@ -3,11 +3,11 @@ import pytest
 from posecore import se3
 from posecore.camera import project
 from synthgen.assets import Assets
-from synthgen.bopset import write_dataset
-from synthgen.framemaker import FrameMaker, FramePlan
-from synthgen.frames import Balls
-from synthgen.sequence import draw_turn, draw_wave
-from synthgen.target import make_targets
+from synthgen.bop.bopset import write_dataset
+from synthgen.bop.framemaker import FrameMaker, FramePlan
+from synthgen.bop.frames import Balls
+from synthgen.bop.sequence import draw_turn, draw_wave
+from synthgen.draw.target import make_targets
 
 FRAMES = 150
 SETTINGS = ("tabletop.tables=2", "frames.objects=[2, 3]", "frames.instances=3", "sequence.pass_every_s=2")

@@ -6,15 +6,15 @@ import pytest
 from blender_scenes import MATT, at, box, scene_of
 from posecore.camera import Camera, back_project, intrinsics
 from posecore.se3 import apply, inverse
-from synthgen import sampling, tabletop
 from synthgen.assets import Assets
 from synthgen.config import TabletopConfig
 from synthgen.dataset import depth_step_m
+from synthgen.draw import sampling, tabletop
+from synthgen.draw.streams import Purpose
+from synthgen.draw.target import make_target, make_targets
 from synthgen.engines import make_engine
 from synthgen.pair import PairMaker
 from synthgen.scene import Light, Material, SceneObject
-from synthgen.streams import Purpose
-from synthgen.target import make_target, make_targets
 
 TABLETOP = ("scene.kind=tabletop", "tabletop.tables=2", "occluders.front=[0, 0]", "tabletop.distractors=[2, 5]")
 
@@ -153,9 +153,13 @@ def test_labels_of_the_table_are_those_of_its_plane(tug, config_of, elevation):
     range_deg = f"tabletop.elevation_deg=[{elevation}, {elevation}]"
     config = config_of(*TABLETOP, range_deg, "tabletop.size_diameter=[30, 30]", "tabletop.distractors=[0, 0]")
     maker = PairMaker(config, make_targets({1: tug}, config))
+    engine, region = make_engine("raster"), (0, 0, maker.camera.width_px, maker.camera.height_px)
+    target = maker.targets[0]
+    engine.load({1: tug, **target.shapes, **target.tables})
     behind = 0
     for index in range(3):
-        draw, rendered, _ = maker.render_frame(index)
+        draw, _ = maker.accepted_scene(index)
+        rendered = engine.render(draw.scene(maker.camera, region, 1))
         table = draw.around[0]
         normal, point = table.T_cam_obj[:3, 2], table.T_cam_obj[:3, 3]
         v, u = np.nonzero(rendered.index == 1)

@@ -15,7 +15,7 @@ from posecore.mesh import Mesh
 
 from synthgen.assets import Assets
 from synthgen.config import SynthConfig
-from synthgen.target import Target, make_targets
+from synthgen.draw.target import Target, make_targets
 
 # What decides the bytes of a sample beside the project itself.
 _PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "numcodecs", "moderngl", "trimesh")
@@ -96,7 +96,7 @@ def load_symmetries(path: str | None, meshes: Mapping[int, Mesh]) -> dict[int, M
 
 
 def estimated_bytes(config: SynthConfig, n: int) -> int:
-    """Rough size of a dataset on disk without rendering anything; `synthgen.estimate` measures.
+    """Rough size of a dataset on disk without rendering anything; `synthgen.run.estimate` measures.
 
     `benchmarks/shard_codecs.py` finds 2.2 to 2.3 bytes a patch pixel at 224 px, and 10 a contour point.
     """

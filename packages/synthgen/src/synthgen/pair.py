@@ -16,18 +16,18 @@ from posecore.raster import Instance, Rasteriser
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import Window, centred, cut, fixed_window
 
-from synthgen import sampling
 from synthgen.assets import Assets
-from synthgen.compose import compose, on_black
 from synthgen.config import SynthConfig
+from synthgen.draw import sampling
+from synthgen.draw.rejection import Tally, nothing_accepted
+from synthgen.draw.sampling import SceneDraw
+from synthgen.draw.streams import Purpose, Subject, stream
+from synthgen.draw.target import Target
 from synthgen.engine import Engine, RenderedScene
 from synthgen.engines import make_engine
-from synthgen.region import bounds, holds, inside_image, region_of, scaled_camera, scaled_window, within
-from synthgen.rejection import Tally, nothing_accepted
-from synthgen.sampling import SceneDraw
+from synthgen.image.compose import compose, on_black
+from synthgen.image.region import bounds, holds, inside_image, region_of, scaled_camera, scaled_window, within
 from synthgen.scene import Light, Scene, SceneObject
-from synthgen.streams import Purpose, Subject, stream
-from synthgen.target import Target
 
 Array = np.ndarray
 
@@ -125,10 +125,10 @@ class PairMaker:
             ConfigError: No acceptable scene or hypothesis is found with this configuration.
         """
         tally = Tally()
-        draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, first_attempt, tally)
+        draw, rejected_scenes = self.accepted_scene(scene_index, first_attempt, tally)
         while (hypotheses := self._hypotheses(draw, scene_index, tally)) is None:
             tally["no hypothesis"] += 1
-            draw, rejected_scenes = self.accepted_scene(Purpose.PAIRS, scene_index, rejected_scenes + 1, tally)
+            draw, rejected_scenes = self.accepted_scene(scene_index, rejected_scenes + 1, tally)
         shot = self._shoot(draw, [h.window for h in hypotheses])
         rows = [
             self._sample(draw, scene_index, number, hypothesis, rejected_scenes, shot)
@@ -137,12 +137,11 @@ class PairMaker:
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
     def accepted_scene(
-        self, purpose: Purpose, scene_index: int, first_attempt: int = 0, tally: Tally | None = None
+        self, scene_index: int, first_attempt: int = 0, tally: Tally | None = None
     ) -> tuple[SceneDraw, int]:
         """Draw scenes until one shows enough of its object.
 
         Args:
-            purpose: Pairs or frames.
             scene_index: Which scene.
             first_attempt: Draws before this one are known to be unusable.
             tally: Why draws were rejected so far; what this call rejects is added.
@@ -155,7 +154,7 @@ class PairMaker:
         """
         tally = Tally() if tally is None else tally
         for attempt in range(first_attempt, MAX_ATTEMPTS):
-            draw = sampling.draw_scene(self.config, self.targets, self.assets, purpose, scene_index, attempt)
+            draw = sampling.draw_scene(self.config, self.targets, self.assets, Purpose.PAIRS, scene_index, attempt)
             box = sampling.target_box(draw.target, self.camera, draw.T_cam_obj)
             inside = sampling.share_inside(box, self.camera)
             if inside < self.config.view.min_inside:
@@ -169,23 +168,8 @@ class PairMaker:
                 tally["hidden"] += 1
             else:
                 return draw, attempt
-        target = self.targets[sampling.target_of(self.config.seed, purpose, scene_index, len(self.targets))]
+        target = self.targets[sampling.target_of(self.config.seed, Purpose.PAIRS, scene_index, len(self.targets))]
         raise nothing_accepted(scene_index, target.name, tally, self.config)
-
-    def render_frame(self, scene_index: int) -> tuple[SceneDraw, RenderedScene, UInt8[Array, "h w 3"]]:
-        """Render a whole camera image of a scene that no training pair shows."""
-        draw, _ = self.accepted_scene(Purpose.FRAMES, scene_index)
-        region = (0, 0, self.camera.width_px, self.camera.height_px)
-        scene = draw.scene(self.camera, region, self.config.samples)
-        rendered = self._engines[self.config.engine].render(scene)
-        return draw, rendered, compose(rendered, scene)
-
-    def silhouette_depth(self, obj_id: int, T_cam_obj: Float[Array, "4 4"], margin_px: int) -> Float[Array, "h w"]:
-        """Camera z of an object alone, on the camera's plane widened by a margin on every side."""
-        K = self.camera.K.copy()
-        K[:2, 2] += margin_px
-        width, height = self.camera.width_px + 2 * margin_px, self.camera.height_px + 2 * margin_px
-        return self._rasteriser.render(obj_id, K, T_cam_obj[None], width, height, rgb=False).depth_m[0]
 
     def _shoot(self, draw: SceneDraw, windows: Sequence[Window]) -> Shot:
         """Render the part of the image that the windows show, no finer than the patches can show it."""

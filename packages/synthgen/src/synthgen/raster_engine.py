@@ -14,11 +14,11 @@ from posecore.raster import MAX_LIGHTS, DirectionalLight, Instance, Rasteriser, 
 from posecore.se3 import apply, inverse
 from posecore.window import Window
 
-from synthgen import pattern
 from synthgen.engine import RenderedScene
-from synthgen.hdri import with_lamps
+from synthgen.image import pattern
+from synthgen.image.hdri import with_lamps
+from synthgen.image.sensor import linear_from_display
 from synthgen.scene import Light, Material, Scene, Vector
-from synthgen.sensor import linear_from_display
 
 Array = np.ndarray
 

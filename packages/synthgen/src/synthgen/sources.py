@@ -11,10 +11,10 @@ from posecore.errors import ConfigError, MeshError
 from posecore.mesh import Mesh, Units, load_mesh
 
 from synthgen.assets import Assets
-from synthgen.background import list_photos
 from synthgen.dataset import load_symmetries
-from synthgen.hdri import list_hdris
-from synthgen.target import object_ids
+from synthgen.draw.target import object_ids
+from synthgen.image.background import list_photos
+from synthgen.image.hdri import list_hdris
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,6 @@ except ImportError as error:
         "it names, or use the engine raster"
     ) from error
 
-from synthgen import scratch
 from synthgen.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_of, occupied_region
 from synthgen.blender.exr import read_channels
 from synthgen.blender.lights import Lamps, World
@@ -26,7 +25,8 @@ from synthgen.blender.objects import Props
 from synthgen.blender.quiet import blender_output_caught
 from synthgen.blender.settings import ENGINE_IDS, set_common, set_cycles, set_eevee
 from synthgen.engine import Device, RenderedScene
-from synthgen.hdri import with_lamps, with_suns
+from synthgen.image.hdri import with_lamps, with_suns
+from synthgen.run import scratch
 from synthgen.scene import Scene
 
 Channels = dict[str, Float[np.ndarray, "h w"]]

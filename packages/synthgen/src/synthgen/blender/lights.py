@@ -5,8 +5,8 @@ import numpy as np
 from jaxtyping import Float
 from mathutils import Matrix
 
-from synthgen import hdri
 from synthgen.blender.camera import blender_from_opencv
+from synthgen.image import hdri
 from synthgen.scene import Environment, Light
 
 PANORAMAS = 8  # worlds kept at a time; one is 8 MB

@@ -8,7 +8,7 @@ from synthgen.cli.console import progress_bar, start_logging, stoppable
 from synthgen.cli.options import scene_options
 
 if TYPE_CHECKING:
-    from synthgen.framemaker import Split
+    from synthgen.bop.framemaker import Split
     from synthgen.sources import Sources
 
 
@@ -71,9 +71,9 @@ def bop(
     """
     from posecore.errors import ConfigError
 
-    from synthgen import bopset
+    from synthgen.bop import bopset
+    from synthgen.bop.framemaker import FramePlan
     from synthgen.config import load_config
-    from synthgen.framemaker import FramePlan
 
     start_logging(verbose)
     if not sequence and (sequences is not None or fps is not None):

@@ -67,9 +67,9 @@ def doctor(
     """
     from posecore.mesh import load_mesh
 
-    from synthgen import doctor as doctoring
     from synthgen.config import load_config
-    from synthgen.speed import measure
+    from synthgen.inspect import doctor as doctoring
+    from synthgen.inspect.speed import measure
 
     config = load_config(preset, overrides)
     if mesh is not None:

@@ -15,7 +15,7 @@ def info(dataset: str, as_json: bool) -> None:
     """
     import json
 
-    from synthgen.info import dataset_info, info_text
+    from synthgen.inspect.info import dataset_info, info_text
 
     found = dataset_info(dataset)
     click.echo(json.dumps(found, indent=1) if as_json else info_text(found))

@@ -21,7 +21,7 @@ def preview(dataset: str, out: Path, count: int, first: int) -> None:
     import cv2
     from posecore.files import write_atomic
 
-    from synthgen.preview import contact_sheet
+    from synthgen.inspect.preview import contact_sheet
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise ConfigError(f"--out {out}: expected a .png or .jpg file")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from posecore.shard import Encoded
 
     from synthgen.config import SynthConfig
-    from synthgen.shardrun import ShardJob
+    from synthgen.run.shardrun import ShardJob
     from synthgen.sources import Sources
 
 MOST_WORKERS = 8
@@ -88,9 +88,10 @@ def render(
     """
     from posecore.shard import ShardWriter
 
-    from synthgen import dataset, lock, pipeline
+    from synthgen import dataset
     from synthgen.config import load_config
-    from synthgen.shardrun import ShardJob
+    from synthgen.run import lock, pipeline
+    from synthgen.run.shardrun import ShardJob
 
     if workers and scheduler:
         raise click.UsageError(
@@ -160,7 +161,7 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     from posecore.errors import RenderError
 
     from synthgen import dataset
-    from synthgen.estimate import check_free_space, estimate
+    from synthgen.run.estimate import check_free_space, estimate
 
     if missing < MEASURED_FROM:
         size = dataset.estimated_bytes(job.config, missing)
@@ -182,7 +183,7 @@ def _duration(seconds: float) -> str:
 
 def _one_sample(out: str, job: "ShardJob", index: int, save: Path | None) -> None:
     """Make one sample again, say whether it is the stored one, and end with 1 when it is not."""
-    from synthgen.only import run_only
+    from synthgen.inspect.only import run_only
 
     made = run_only(out, job, index, save)
     click.echo(made.text)

@@ -15,8 +15,8 @@ from posecore.contour import distance_transform_px
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import Window, fixed_window
 
+from synthgen.image.region import inside_image
 from synthgen.pair import MAX_ATTEMPTS, MAX_HYPOTHESIS_ATTEMPTS
-from synthgen.region import inside_image
 from synthgen.verify.facts import Batch
 
 Array = np.ndarray

@@ -10,7 +10,7 @@ import numpy as np
 from posecore.errors import ShardError, StorageError
 from posecore.shard import ShardReader
 
-from synthgen.preview import Image, sample_row, title_row
+from synthgen.inspect.preview import Image, sample_row, title_row
 from synthgen.verify import plots
 from synthgen.verify.coverage import scenes_of, view_counts
 from synthgen.verify.findings import Finding, Report

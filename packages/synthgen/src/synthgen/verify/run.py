@@ -16,8 +16,8 @@ from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, n_shards
 from posecore.shard.group import metadata
 
-from synthgen.lifeline import die_with_parent
 from synthgen.pair import limit_threads
+from synthgen.run.processes import die_with_parent
 from synthgen.verify.checks import CHECKS
 from synthgen.verify.coverage import Coverage, coverage_of, joined
 from synthgen.verify.facts import Batch, Facts, load_facts, manifest_lines

@@ -14,7 +14,10 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when its parent is gone, also while it hangs."""
+    """Have the kernel kill this process when its parent is gone, also by `kill -9` and while this one hangs.
+
+    Only Linux can do that; elsewhere nothing happens, and multiprocessing's own watch has to do.
+    """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -34,7 +37,7 @@ def forget_blenders_paths() -> None:
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Start processes that ignore ctrl-C.
+    """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
 
     A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
     """

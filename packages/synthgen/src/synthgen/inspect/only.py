@@ -13,8 +13,8 @@ from posecore.files import write_atomic
 from posecore.shard import GROUP, ShardReader, ShardWriter, field_table
 from posecore.store import open_store
 
-from synthgen.preview import sample_row, title_row
-from synthgen.shardrun import ShardJob, ShardRenderer
+from synthgen.inspect.preview import sample_row, title_row
+from synthgen.run.shardrun import ShardJob, ShardRenderer
 from synthgen.verify.facts import manifest_lines
 
 Array = np.ndarray

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from posecore.errors import ConfigError
 
-from synthgen import hdri
+from synthgen.image import hdri
 from synthgen.scene import Background, Scene
 
 Array = np.ndarray

@@ -18,9 +18,10 @@ from posecore import shard
 from posecore.errors import RenderError
 from posecore.files import sha256_bytes
 
-from synthgen import dataset, scratch
-from synthgen.lifeline import die_with_parent
-from synthgen.shardrun import SceneError, ShardJob, ShardRenderer
+from synthgen import dataset
+from synthgen.run import scratch
+from synthgen.run.processes import die_with_parent, forget_blenders_paths
+from synthgen.run.shardrun import SceneError, ShardJob, ShardRenderer
 
 GROWTH_LIMIT_BYTES = 1 << 30
 _RECYCLE_S = 0.5  # a rescheduled shard bounces between scheduler and worker until the worker is marked as leaving
@@ -67,6 +68,7 @@ class RendererPlugin(WorkerPlugin):
         scratch.sweep()
         if worker.nanny is not None:
             die_with_parent()
+            forget_blenders_paths()
         # A paused worker waits for memory that only a restart would free.
         worker.memory_manager.memory_pause_fraction = False
         if self.gpus:

@@ -13,11 +13,11 @@ from jaxtyping import Float, UInt8
 from posecore.mesh import Mesh
 from posecore.se3 import apply, make_T, random_rotation, rotation_from_rotvec
 
-from synthgen import background
 from synthgen.config import TabletopConfig, ViewConfig
-from synthgen.rest import Rest
+from synthgen.draw.rest import Rest
+from synthgen.draw.streams import Purpose, Subject, child_seed, stream
+from synthgen.image import background
 from synthgen.scene import Background, Material, SceneObject
-from synthgen.streams import Purpose, Subject, child_seed, stream
 
 Array = np.ndarray
 MaterialOf = Callable[[np.random.Generator], Material]

@@ -17,8 +17,8 @@ from synthgen.config import SynthConfig
 from synthgen.dataset import versions
 from synthgen.devices import list_gpus
 from synthgen.engine import ENGINE_NAMES
+from synthgen.inspect.speed import Speed
 from synthgen.machine import free_bytes, machine
-from synthgen.speed import Speed
 
 State = Literal["ok", "warning", "missing"]
 

@@ -29,13 +29,13 @@ from posecore.errors import ConfigError, DatasetError, RenderError
 from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh
 
-from synthgen import lock, processes
 from synthgen.assets import Assets
+from synthgen.bop.framemaker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig
 from synthgen.dataset import versions
-from synthgen.framemaker import FrameMaker, FramePlan
+from synthgen.draw.target import Target, make_targets
 from synthgen.pair import limit_threads
-from synthgen.target import Target, make_targets
+from synthgen.run import lock, processes
 
 CARD = "synthgen.json"
 _FARTHEST_STEP = 65535

@@ -15,16 +15,17 @@ from posecore.mesh import Mesh
 from posecore.raster import Instance, Rasteriser
 from posecore.window import Window, centred, silhouette_box
 
-from synthgen import background, sampling, sensor
 from synthgen.assets import Assets
+from synthgen.bop.frames import Balls, Layout, View, clearance_m, draw_camera, draw_layout, frame_sensor
+from synthgen.bop.sequence import Motion
 from synthgen.config import SynthConfig
+from synthgen.draw import sampling
+from synthgen.draw.streams import Purpose, Subject, child_seed, stream
+from synthgen.draw.target import Target
 from synthgen.engine import RenderedScene
 from synthgen.engines import make_engine
-from synthgen.frames import Balls, Layout, View, clearance_m, draw_camera, draw_layout, frame_sensor
+from synthgen.image import background, sensor
 from synthgen.scene import Background, Scene, SceneObject
-from synthgen.sequence import Motion
-from synthgen.streams import Purpose, Subject, child_seed, stream
-from synthgen.target import Target
 
 Array = np.ndarray
 Split = Literal["test", "val", "train_pbr"]

@@ -11,8 +11,8 @@ import OpenEXR
 from jaxtyping import Float, UInt8
 from posecore.errors import ConfigError
 
+from synthgen.image.sensor import display_from_linear
 from synthgen.scene import Background, Environment, Light, Scene
-from synthgen.sensor import display_from_linear
 
 Array = np.ndarray
 

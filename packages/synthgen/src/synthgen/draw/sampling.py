@@ -12,12 +12,12 @@ from posecore.camera import Camera
 from posecore.se3 import inverse, make_T, random_direction, random_rotation, rotation_from_rotvec
 from posecore.window import silhouette_box
 
-from synthgen import occluders, tabletop
 from synthgen.assets import Assets
 from synthgen.config import LightConfig, MaterialConfig, PerturbationConfig, SensorConfig, SynthConfig, ViewConfig
+from synthgen.draw import occluders, tabletop
+from synthgen.draw.streams import Purpose, Subject, child_seed, stream
+from synthgen.draw.target import Target
 from synthgen.scene import Background, Environment, Light, Material, Pattern, Scene, SceneObject, Sensor, Vector
-from synthgen.streams import Purpose, Subject, child_seed, stream
-from synthgen.target import Target
 
 Array = np.ndarray
 

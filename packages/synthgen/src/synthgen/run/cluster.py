@@ -1,8 +1,6 @@
 """The processes that render: local ones, or those of a running dask cluster."""
 
 import logging
-import signal
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -11,6 +9,8 @@ import dask
 from distributed import Client, LocalCluster, Nanny
 from distributed.system import MEMORY_LIMIT
 from posecore.errors import RenderError
+
+from synthgen.run.processes import interrupts_ignored
 
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
 SETTINGS = {
@@ -52,7 +52,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
             with _remote(scheduler) as client:
                 yield client
             return
-        with _interrupts_ignored():
+        with interrupts_ignored():
             cluster = _local(workers)
         with cluster, Client(cluster) as client:
             yield client
@@ -79,7 +79,7 @@ def revive(local: LocalCluster, suspected: set[Any]) -> set[Any]:
         for name in given_up:
             local.workers.pop(name, None)
             local.sync(nannies[name].close, asynchronous=False)
-        with _interrupts_ignored():
+        with interrupts_ignored():
             local.scale(len(local.worker_spec))
     return dead - given_up
 
@@ -116,19 +116,3 @@ def _remote(scheduler: str) -> Client:
 
 def _first_line(error: BaseException) -> str:
     return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
-@contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
-
-    A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
-    """
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set signal handlers
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

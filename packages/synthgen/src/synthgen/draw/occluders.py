@@ -12,8 +12,8 @@ from posecore.mesh import Mesh
 from posecore.se3 import make_T, random_rotation
 
 from synthgen.config import OccluderConfig
+from synthgen.draw.streams import Purpose, Subject, stream
 from synthgen.scene import Material, SceneObject
-from synthgen.streams import Purpose, Subject, stream
 
 Array = np.ndarray
 

@@ -15,12 +15,12 @@ from jaxtyping import Float
 from posecore.camera import Camera, project
 from posecore.se3 import inverse, make_T, random_direction, random_rotation, rotation_from_rotvec
 
-from synthgen import occluders
+from synthgen.bop.frames import Balls, Layout, View, at_pixel, level_view, moved_light, radius_m
 from synthgen.config import SynthConfig
-from synthgen.frames import Balls, Layout, View, at_pixel, level_view, moved_light, radius_m
+from synthgen.draw import occluders
+from synthgen.draw.streams import Purpose, Subject, child_seed, stream
+from synthgen.draw.target import Target
 from synthgen.scene import Light, SceneObject
-from synthgen.streams import Purpose, Subject, child_seed, stream
-from synthgen.target import Target
 
 Array = np.ndarray
 

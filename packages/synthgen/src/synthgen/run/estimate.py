@@ -11,10 +11,10 @@ from pathlib import Path
 from posecore import shard
 from posecore.errors import PoseError, RenderError, StorageError
 
-from synthgen.lifeline import die_with_parent
 from synthgen.machine import free_bytes
 from synthgen.pair import concatenate
-from synthgen.shardrun import ShardJob, ShardRenderer, scenes_in
+from synthgen.run.processes import die_with_parent
+from synthgen.run.shardrun import ShardJob, ShardRenderer, scenes_in
 
 _START_S = 300.0  # for Blender to start and the first scene to compile its kernels
 _SPARE_BYTES = 256 * 2**20  # of a disk that is not filled to the last byte
@@ -59,7 +59,7 @@ def estimate(job: ShardJob, *, scenes: int = 4, most_seconds: float = 20.0) -> E
         PoseError: What the renderer raised: these settings cannot be rendered here.
         RenderError: The process died, which a crashing renderer does, or gave no answer in time.
     """
-    command = [sys.executable, "-c", "from synthgen.estimate import main; main()"]
+    command = [sys.executable, "-c", "from synthgen.run.estimate import main; main()"]
     seconds = _START_S + most_seconds
     # Not multiprocessing: that waits for ever when its process is killed while it starts.
     try:

@@ -15,12 +15,12 @@ from posecore.camera import Camera
 from posecore.mesh import Mesh
 from posecore.se3 import inverse, make_T, random_direction, random_rotation, rotation_from_rotvec
 
-from synthgen import sampling, tabletop
 from synthgen.config import LightConfig, SynthConfig
-from synthgen.sampling import SceneDraw
+from synthgen.draw import sampling, tabletop
+from synthgen.draw.sampling import SceneDraw
+from synthgen.draw.streams import Subject, child_seed, stream
+from synthgen.draw.target import Target
 from synthgen.scene import Background, Environment, Light, Scene, SceneObject, Sensor, Vector
-from synthgen.streams import Subject, child_seed, stream
-from synthgen.target import Target
 
 Array = np.ndarray
 

@@ -22,9 +22,9 @@ from distributed.scheduler import KilledWorker
 from posecore import shard
 from posecore.errors import PoseError, RenderError
 
-from synthgen import cluster
-from synthgen.shardrun import ShardJob, scenes_in
-from synthgen.worker import Outcome, RendererPlugin, render_shard, try_scene
+from synthgen.run import cluster
+from synthgen.run.shardrun import ShardJob, scenes_in
+from synthgen.run.worker import Outcome, RendererPlugin, render_shard, try_scene
 
 log = logging.getLogger(__name__)
 

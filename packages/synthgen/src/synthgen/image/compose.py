@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import UInt8
 
-from synthgen import background, sensor
 from synthgen.engine import RenderedScene
+from synthgen.image import background, sensor
 from synthgen.scene import Scene
 
 Array = np.ndarray

@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from synthgen.image.sensor import display_from_linear, linear_from_display
 from synthgen.scene import Material, Pattern
-from synthgen.sensor import display_from_linear, linear_from_display
 
 Array = np.ndarray
 

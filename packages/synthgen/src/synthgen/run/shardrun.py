@@ -12,8 +12,8 @@ from posecore.mesh import Mesh
 
 from synthgen.assets import Assets
 from synthgen.config import SynthConfig
+from synthgen.draw.target import make_targets
 from synthgen.pair import PairMaker, concatenate, limit_threads
-from synthgen.target import make_targets
 
 REPLACEMENT_ATTEMPT = 50
 """A scene in quarantine is drawn from this attempt on; its manifest line lists it under `quarantined`."""

@@ -1,0 +1,1 @@
+"""BOP datasets: frames of many objects, and sequences."""

@@ -1,0 +1,1 @@
+"""Datasets of any size: shards on processes and clusters, faults, locks, estimates."""
