@@ -157,7 +157,7 @@ def test_labels_of_the_table_are_those_of_its_plane(tug, config_of, elevation):
     target = maker.targets[0]
     engine.load({1: tug, **target.shapes, **target.tables})
     behind = 0
-    for index in range(3):
+    for index in range(6):
         draw, _ = maker.accepted_scene(index)
         rendered = engine.render(draw.scene(maker.camera, region, 1))
         table = draw.around[0]
