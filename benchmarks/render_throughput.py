@@ -30,6 +30,7 @@ from posecore import shard
 from posecore.camera import Camera
 from posecore.mesh import Mesh, load_mesh
 from synthgen import dataset
+from synthgen.assets import Assets
 from synthgen.config import SynthConfig, load_config
 from synthgen.draw.target import make_target
 from synthgen.pair import PairMaker, concatenate, limit_threads
@@ -62,7 +63,7 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     """Milliseconds a pair by stage, one process, one thread."""
     limit_threads(1)
     maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
-    card = dataset.make_card(config, config.shard_size, {1: mesh}, ())
+    card = dataset.make_card(config, config.shard_size, {1: mesh}, Assets())
     for scene in range(3):  # loads, compiles
         maker.samples(10_000_000 + scene)
     watch = Stopwatch()
@@ -122,7 +123,8 @@ def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
             sys.exit(process.stderr.read())
     # the first shards of all workers come together: the clock starts when the last of them is there
     first = seen[min(arguments.workers, len(seen) - 1) - 1]
-    return (seen[-1][1] - first[1]) / (seen[-1][0] - first[0])
+    rate: float = (seen[-1][1] - first[1]) / (seen[-1][0] - first[0])
+    return rate
 
 
 def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:

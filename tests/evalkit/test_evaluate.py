@@ -8,13 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evalkit import silhouette
-from evalkit.evaluate import Evaluator, column
+from evalkit.evaluate import Evaluator
 from evalkit.files import ResultFile, load_result_files
 from evalkit.metrics import vss
 from evalkit.pairing import Pair, pair_up
+from evalkit.scored import Scored
 from evalkit.scores import by_level, by_object, scores
 from evalkit.silhouette import Patch, View
-from evalkit.summary import Scored, start_of
+from evalkit.summary import start_of
+from evalkit.table import column, table_of
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, GroundTruth, Target, symmetry_transforms, write_results, write_targets
 from posecore.errors import DatasetError, ResultFileError
@@ -51,12 +53,12 @@ def test_symmetric_turns_score_as_the_truth(dataset, perfect):
     others = [e for e in perfect if e.obj_id == TUG]
     with Evaluator(dataset) as evaluator:
         rows = evaluator.evaluate(pair_up(dataset, in_memory(turned + others)).pairs)
-    bobbins = [row for row in rows if row.obj_id == BOBBIN]
+    bobbins = rows[rows.obj_id == BOBBIN]
     assert column(bobbins, "mssd_m").max() < 1e-9
     assert column(bobbins, "mspd_px").max() < 1e-6
     assert column(bobbins, "re_sym_rad").max() < 1e-6
     assert column(bobbins, "re_rad").min() > 1.0
-    assert column(bobbins, "adi_m").max() < 0.02 * bobbins[0].diameter_m
+    assert column(bobbins, "adi_m").max() < 0.02 * bobbins.diameter_m.iloc[0]
     assert column(bobbins, "vss").min() > 0.97
     assert by_object(rows)[BOBBIN]["5cm5deg"] == 1.0
 
@@ -204,7 +206,8 @@ def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
 def test_a_file_is_compared_with_the_start_poses_it_came_from():
     def scored(name, **sidecar):
         file = ResultFile(name=name, path=Path(f"{name}.csv"), sha256="", sidecar=sidecar, estimates=[])
-        return Scored(file=file, pairs=[], rows=[], ignored=0)
+        none = np.zeros((0, 4, 4))
+        return Scored(file=file, table=table_of([]), T_est=none, T_gt=none, ignored=0)
 
     starts = [scored("near", method="start"), scored("far", method="start")]
     assert start_of(scored("a", init="far.csv"), starts) is starts[1]
@@ -227,7 +230,7 @@ def test_a_ball_is_scored_without_sampling_error(dataset_path, tmp_path, perfect
     estimate = replace(perfect[0], T_cam_obj=turned, obj_id=TUG)
     pair = Pair(scene_id=IMAGES[0][0], im_id=IMAGES[0][1], truth=truth, estimate=estimate)
     with Evaluator(dataset) as evaluator:
-        (row,) = evaluator.evaluate([pair])
+        row = evaluator.evaluate([pair]).iloc[0]
     assert row.mssd_m < 1e-9
     assert row.re_sym_rad < 1e-6
     assert isinstance(truth, GroundTruth)

@@ -36,7 +36,7 @@ def test_every_error_agrees_with_bop_toolkit(shared_data):
     (file,) = load_result_files([folder / "init_ssd6d-like_lmo-test.csv"], dataset)
     with Evaluator(dataset) as evaluator:
         rows = evaluator.evaluate(pair_up(dataset, file).pairs)
-    rows_of = {(row.scene_id, row.im_id, row.obj_id): row for row in rows}
+    rows_of = {(row.scene_id, row.im_id, row.obj_id): row for row in rows.itertuples()}
     pairs = [(rows_of[g["scene_id"], g["im_id"], g["obj_id"]], g) for g in golden]
     assert len(pairs) == len(rows) == 349
     values = {

@@ -2,11 +2,12 @@
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float
 from posecore.bop import BopDataset, GroundTruth, symmetry_transforms
 from posecore.camera import Camera
@@ -19,55 +20,16 @@ from scipy.spatial import ConvexHull, QhullError
 from evalkit import metrics, silhouette
 from evalkit.pairing import Level, Pair
 from evalkit.silhouette import Patch, View
+from evalkit.table import table_of
 
 Array = np.ndarray
 VssKind = Literal["full", "visible"]
 Progress = Callable[[int], None]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """Errors of one expected pose. Where it is missing they are NaN, `vss` is 0 and `line` is 0.
-
-    Lengths are metres, angles radians; `dx_m`, `dy_m`, `dz_m` are estimated minus true along the camera's axes;
-    `_sym` is the value at the object's best symmetry; `line` and `score` are the estimate's in its file.
-    """
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    gt_index: int
-    visib_fract: float
-    found: bool
-    line: int
-    score: float
-    time_s: float
-    start_angle_deg: float
-    start_translation_diameter: float
-    diameter_m: float
-    symmetric: bool
-    image_width_px: int
-    vss: float
-    add_m: float = np.nan
-    adi_m: float = np.nan
-    mssd_m: float = np.nan
-    mspd_px: float = np.nan
-    proj_px: float = np.nan
-    proj_sym_px: float = np.nan
-    re_rad: float = np.nan
-    re_sym_rad: float = np.nan
-    te_m: float = np.nan
-    dx_m: float = np.nan
-    dy_m: float = np.nan
-    dz_m: float = np.nan
-
-
-ROW_FIELDS = tuple(field.name for field in fields(Row))
-
-
-def column(rows: Sequence[Row], name: str) -> Float[Array, " n"]:
-    """One field of all rows as float64."""
-    return np.array([getattr(row, name) for row in rows], dtype=np.float64)
+ERRORS = (
+    *("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px"),
+    *("re_rad", "re_sym_rad", "te_m", "dx_m", "dy_m", "dz_m"),
+)
+"""Columns that are NaN where an estimate is missing."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -101,7 +63,7 @@ class Evaluator:
         """Free the renderer."""
         self.rasteriser.close()
 
-    def evaluate(self, pairs: Sequence[Pair], advance: Progress = lambda done: None) -> list[Row]:
+    def evaluate(self, pairs: Sequence[Pair], advance: Progress = lambda done: None) -> pd.DataFrame:
         """Score pairs, in their order; `advance` is called with the number of pairs done since the last call.
 
         Raises:
@@ -112,7 +74,7 @@ class Evaluator:
         for pair, value in zip(pairs, values, strict=True):
             rows.append(self._row(pair, value))
             advance(1)
-        return rows
+        return table_of(rows)
 
     def camera(self, scene_id: int, im_id: int) -> Camera:
         """Intrinsics of an image, read once."""
@@ -173,29 +135,49 @@ class Evaluator:
             )
         return silhouette.vss_visible(patch, true, self.camera(pair.scene_id, pair.im_id).K, depth_m)
 
-    def _row(self, pair: Pair, vss: float) -> Row:
+    def _row(self, pair: Pair, vss: float) -> dict[str, Any]:
         truth, estimate = pair.truth, pair.estimate
         info = self.dataset.models_info[truth.obj_id]
         level = pair.level or Level(angle_deg=np.nan, translation_diameter=np.nan)
         camera = self.camera(pair.scene_id, pair.im_id)
-        errors = {} if estimate is None else self._errors(estimate.T_cam_obj, truth, camera)
-        return Row(
-            scene_id=pair.scene_id,
-            im_id=pair.im_id,
-            obj_id=truth.obj_id,
-            gt_index=truth.gt_index,
-            visib_fract=np.nan if truth.visib_fract is None else truth.visib_fract,
-            found=estimate is not None,
-            line=0 if estimate is None else estimate.line,
-            score=np.nan if estimate is None else estimate.score,
-            time_s=np.nan if estimate is None else estimate.time_s,
-            start_angle_deg=level.angle_deg,
-            start_translation_diameter=level.translation_diameter,
-            diameter_m=info.diameter_m,
-            symmetric=info.is_symmetric,
-            image_width_px=camera.width_px,
-            vss=vss,
-            **errors,
+        azimuth_deg, elevation_deg = metrics.viewpoint_deg(truth.T_cam_obj)
+        return {
+            "scene_id": pair.scene_id,
+            "im_id": pair.im_id,
+            "obj_id": truth.obj_id,
+            "gt_index": truth.gt_index,
+            "visib_fract": np.nan if truth.visib_fract is None else truth.visib_fract,
+            "found": estimate is not None,
+            "line": 0 if estimate is None else estimate.line,
+            "score": np.nan if estimate is None else estimate.score,
+            "time_s": np.nan if estimate is None else estimate.time_s,
+            "start_angle_deg": level.angle_deg,
+            "start_translation_diameter": level.translation_diameter,
+            "diameter_m": info.diameter_m,
+            "symmetric": info.is_symmetric,
+            "image_width_px": camera.width_px,
+            "distance_m": float(truth.T_cam_obj[2, 3]),
+            "view_azimuth_deg": azimuth_deg,
+            "view_elevation_deg": elevation_deg,
+            "other_mssd_m": self._other_mssd_m(pair),
+            "vss": vss,
+            **(dict.fromkeys(ERRORS, np.nan) if estimate is None else self._errors(estimate.T_cam_obj, truth, camera)),
+        }
+
+    def _other_mssd_m(self, pair: Pair) -> float:
+        """Smallest MSSD to another true instance of the object in the image."""
+        truth, estimate = pair.truth, pair.estimate
+        if estimate is None:
+            return np.nan
+        others = [
+            gt
+            for gt in self.dataset.gt(pair.scene_id, pair.im_id)
+            if gt.obj_id == truth.obj_id and gt.has_pose and gt.gt_index != truth.gt_index
+        ]
+        model = self._model(truth.obj_id)
+        return min(
+            (metrics.mssd(estimate.T_cam_obj, gt.T_cam_obj, model.hull_m, model.symmetries) for gt in others),
+            default=np.nan,
         )
 
     def _errors(self, T_est: Float[Array, "4 4"], truth: GroundTruth, camera: Camera) -> dict[str, float]:

@@ -122,6 +122,12 @@ def te_axes(T_est: Pose, T_gt: Pose) -> Float[Array, "3"]:
     return np.asarray(T_est[:3, 3] - T_gt[:3, 3])
 
 
+def viewpoint_deg(T_cam_obj: Pose) -> tuple[float, float]:
+    """Direction of the camera seen from the object, degrees: azimuth about z from x, elevation over the xy plane."""
+    x, y, z = -_inverse(T_cam_obj[:3, :3]) @ T_cam_obj[:3, 3]
+    return float(np.rad2deg(np.arctan2(y, x))), float(np.rad2deg(np.arctan2(z, np.hypot(x, y))))
+
+
 def vss(mask_est: Bool[Array, "h w"], mask_gt: Bool[Array, "h w"]) -> float:
     """Visual surface similarity: intersection over union of two silhouettes, 0 where both are empty.
 

@@ -5,12 +5,15 @@ from html import escape
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from evalkit import html, pictures, plots
-from evalkit.evaluate import Evaluator, Row, column
+from evalkit.evaluate import Evaluator
 from evalkit.html import Shot
 from evalkit.plots import Series
-from evalkit.summary import CaseKey, Scored, visibility_bins, worst_cases
+from evalkit.scored import CaseKey, Scored
+from evalkit.summary import visibility_bins, worst_cases
+from evalkit.table import column
 
 VISIBILITY_EDGES = tuple(float(edge) for edge in np.linspace(0.0, 1.0, 11))
 MISSING_LISTED = 20
@@ -84,16 +87,16 @@ def _distribution_plots(scored: Sequence[Scored], colours: Sequence[str]) -> str
     def figure(title: str, x_label: str, value_of: Any, limit: float) -> str:
         series = []
         for item, colour in zip(scored, colours, strict=True):
-            x, y = plots.cumulative(value_of(item.rows), limit)
+            x, y = plots.cumulative(value_of(item.table), limit)
             series.append(Series(name=item.file.name, colour=colour, x=x, y=y, dashed=item.file.is_start))
         return plots.line_plot(title, x_label, "share of poses", series, share=True)
 
     figures = [
-        figure("Rotation error at most", "degrees", lambda rows: np.rad2deg(column(rows, "re_sym_rad")), 45.0),
-        figure("ADD at most", "diameters", lambda rows: column(rows, "add_m") / column(rows, "diameter_m"), 0.5),
+        figure("Rotation error at most", "degrees", lambda table: np.rad2deg(column(table, "re_sym_rad")), 45.0),
+        figure("ADD at most", "diameters", lambda table: column(table, "add_m") / column(table, "diameter_m"), 0.5),
         figure("Silhouette mismatch (1 - VSS) at most", "1 - VSS", _mismatch, 1.0),
         *[
-            figure(f"Error along camera {axis} at most", "mm", lambda rows, axis=axis: _axis_mm(rows, axis), limit)
+            figure(f"Error along camera {axis} at most", "mm", lambda table, axis=axis: _axis_mm(table, axis), limit)
             for axis, limit in (("x", 30.0), ("y", 30.0), ("z", 150.0))
         ],
     ]
@@ -107,7 +110,7 @@ def _distribution_plots(scored: Sequence[Scored], colours: Sequence[str]) -> str
             markers=True,
         )
         for item, colour in zip(scored, colours, strict=True)
-        if (visible := visibility_bins(item.rows, VISIBILITY_EDGES))
+        if (visible := visibility_bins(item.table, VISIBILITY_EDGES))
     ]
     if bins:
         figures.append(
@@ -116,12 +119,12 @@ def _distribution_plots(scored: Sequence[Scored], colours: Sequence[str]) -> str
     return f'<div class="plots">{"".join(figures)}</div>'
 
 
-def _mismatch(rows: Sequence[Row]) -> np.ndarray:
-    return np.where(column(rows, "found") > 0, 1.0 - column(rows, "vss"), np.nan)
+def _mismatch(table: pd.DataFrame) -> np.ndarray:
+    return np.where(column(table, "found") > 0, 1.0 - column(table, "vss"), np.nan)
 
 
-def _axis_mm(rows: Sequence[Row], axis: str) -> np.ndarray:
-    return np.asarray(np.abs(column(rows, f"d{axis}_m")) * 1e3)
+def _axis_mm(table: pd.DataFrame, axis: str) -> np.ndarray:
+    return np.asarray(np.abs(column(table, f"d{axis}_m")) * 1e3)
 
 
 LEVEL_PLOTS = (
@@ -206,38 +209,38 @@ def _case(
     if rgb is None:
         return ""
     present = [(item, lookup[key]) for item, lookup in zip(scored, index_of, strict=True) if key in lookup]
-    truth = present[0][0].pairs[present[0][1]].truth
-    poses = [item.pairs[index].estimate for item, index in present]
+    first, place = present[0]
+    row, T_gt = first.table.iloc[place], first.T_gt[place]
+    obj_id = int(row.obj_id)
+    poses = [item.T_est[index] if item.table.found.iloc[index] else None for item, index in present]
     camera = evaluator.camera(scene_id, im_id)
-    known = [pose.T_cam_obj for pose in poses if pose is not None]
-    window = pictures.common_window(evaluator, truth.obj_id, camera, truth.T_cam_obj, known)
+    window = pictures.common_window(evaluator, obj_id, camera, T_gt, [T_est for T_est in poses if T_est is not None])
     shots = []
-    for (item, index), pose in zip(present, poses, strict=True):
-        T_est = None if pose is None else pose.T_cam_obj
-        image = pictures.overlay(evaluator, rgb, camera, window, truth.obj_id, truth.T_cam_obj, T_est)
-        caption = _caption(item.rows[index])
+    for (item, index), T_est in zip(present, poses, strict=True):
+        image = pictures.overlay(evaluator, rgb, camera, window, obj_id, T_gt, T_est)
+        caption = _caption(item.table.iloc[index])
         shots.append(Shot(name=item.file.name, url=pictures.data_url(image), caption=caption))
-    row = present[0][0].rows[present[0][1]]
     visible = "" if np.isnan(row.visib_fract) else f", {100 * row.visib_fract:.0f}% visible"
     level = ""
     if np.isfinite(row.start_angle_deg):
         level = f", start {row.start_angle_deg:g}° and {row.start_translation_diameter:g} d off"
-    return html.case(f"Scene {scene_id}, image {im_id}, object {truth.obj_id}{visible}{level}", shots)
+    return html.case(f"Scene {scene_id}, image {im_id}, object {obj_id}{visible}{level}", shots)
 
 
-def _caption(row: Row) -> str:
+def _caption(row: Any) -> str:
     if not row.found:
         return "missing"
-    moved = ", ".join(f"{axis}\N{NO-BREAK SPACE}{1e3 * getattr(row, f'd{axis}_m'):+.1f}" for axis in "xyz")
+    moved = ", ".join(f"{axis}\N{NO-BREAK SPACE}{1e3 * row[f'd{axis}_m']:+.1f}" for axis in "xyz")
     return f"VSS {row.vss:.3f}, {np.rad2deg(row.re_sym_rad):.1f}°, {moved} mm"
 
 
 def _missing(scored: Sequence[Scored]) -> str:
     parts = []
     for item in scored:
-        rows = [row for row in item.rows if not row.found]
-        if rows:
-            named = ", ".join(f"{row.scene_id}/{row.im_id}/{row.obj_id}" for row in rows[:MISSING_LISTED])
+        rows = item.table[~item.table.found]
+        if len(rows):
+            listed = rows[["scene_id", "im_id", "obj_id"]].head(MISSING_LISTED)
+            named = ", ".join("/".join(map(str, ids)) for ids in listed.to_numpy().tolist())
             more = f" and {len(rows) - MISSING_LISTED} more" if len(rows) > MISSING_LISTED else ""
             parts.append(html.paragraph(f"{item.file.name}: {len(rows)} (scene/image/object) {named}{more}."))
     return "".join(parts)

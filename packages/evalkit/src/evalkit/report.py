@@ -1,7 +1,5 @@
 """A report folder: one HTML page, one CSV line for each pose, one JSON summary."""
 
-import csv
-import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,16 +7,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
+from jaxtyping import Float
 from posecore.bop import BopDataset
 from posecore.errors import ConfigError
 from posecore.files import write_atomic
 
-from evalkit.evaluate import ROW_FIELDS, Evaluator, Row, VssKind
+from evalkit.evaluate import Evaluator, VssKind
 from evalkit.files import load_result_files
 from evalkit.page import report_page
-from evalkit.pairing import Pairing, pair_up
-from evalkit.summary import Scored, summarise
+from evalkit.pairing import Pair, Pairing, pair_up
+from evalkit.scored import Scored
+from evalkit.summary import summarise
 
+Array = np.ndarray
+NO_POSE = np.full((4, 4), np.nan)
 Start = Callable[[str, int], Callable[[int], None]]
 """Announces a result file and its number of poses; returns what is called as they are done."""
 
@@ -63,8 +66,9 @@ def write_report(
         scored = [
             Scored(
                 file=file,
-                pairs=pairing.pairs,
-                rows=evaluator.evaluate(pairing.pairs, start(file.name, len(pairing.pairs))),
+                table=evaluator.evaluate(pairing.pairs, start(file.name, len(pairing.pairs))),
+                T_est=_poses(pairing.pairs, lambda pair: NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj),
+                T_gt=_poses(pairing.pairs, lambda pair: pair.truth.T_cam_obj),
                 ignored=pairing.ignored,
             )
             for file, pairing in zip(files, pairings, strict=True)
@@ -83,21 +87,17 @@ def write_report(
     return written
 
 
+def _poses(pairs: Sequence[Pair], pose_of: Callable[[Pair], Array]) -> Float[Array, "n 4 4"]:
+    return np.array([pose_of(pair) for pair in pairs], np.float64).reshape(-1, 4, 4)
+
+
 def estimates_csv(scored: Sequence[Scored]) -> str:
     """One line for each expected pose of each result file; NaN is left empty, units are in the column names."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["results", *ROW_FIELDS])
+    parts = []
     for item in scored:
-        for row in item.rows:
-            writer.writerow([item.file.name, *(_plain(row, name) for name in ROW_FIELDS)])
-    return text.getvalue()
-
-
-def _plain(row: Row, name: str) -> str:
-    value = getattr(row, name)
-    if isinstance(value, bool | np.bool_):
-        return str(int(value))
-    if isinstance(value, float):
-        return "" if np.isnan(value) else f"{value:.9g}"
-    return str(value)
+        part = item.table.copy()
+        part[["found", "symmetric"]] = part[["found", "symmetric"]].astype("int64")
+        part.insert(0, "results", item.file.name)
+        parts.append(part)
+    text: str = pd.concat(parts).to_csv(index=False, lineterminator="\n", float_format="%.9g")
+    return text

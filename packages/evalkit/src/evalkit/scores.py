@@ -1,12 +1,12 @@
-"""Rows to scores: means, medians, recalls and areas under curves, with missing estimates counted as failures."""
+"""Tables to scores: means, medians, recalls and areas under curves, with missing estimates counted as failures."""
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float
 
-from evalkit.evaluate import Row, column
+from evalkit.table import column
 
 Array = np.ndarray
 AUC_LIMIT_M = 0.1
@@ -36,32 +36,32 @@ DEFINITIONS = {
 }
 
 
-def scores(rows: Sequence[Row]) -> dict[str, Any]:
-    """Scores of a group of rows; shares and recalls are over all rows, means and medians over the found ones.
+def scores(table: pd.DataFrame) -> dict[str, Any]:
+    """Scores of a table; shares and recalls are over all rows, means and medians over the found ones.
 
     Keys carry units. A value without rows behind it is NaN.
     """
-    found = [row for row in rows if row.found]
-    diameter = column(rows, "diameter_m")
-    symmetric = column(rows, "symmetric") > 0
-    add, adi = column(rows, "add_m"), column(rows, "adi_m")
-    re_sym_deg = np.rad2deg(column(rows, "re_sym_rad"))
+    found = table[table.found]
+    diameter = column(table, "diameter_m")
+    symmetric = column(table, "symmetric") > 0
+    add, adi = column(table, "add_m"), column(table, "adi_m")
+    re_sym_deg = np.rad2deg(column(table, "re_sym_rad"))
     result: dict[str, Any] = {
-        "expected": len(rows),
+        "expected": len(table),
         "found": len(found),
-        "missing": len(rows) - len(found),
-        "vss_mean": _mean(column(rows, "vss")),
+        "missing": len(table) - len(found),
+        "vss_mean": _mean(column(table, "vss")),
         "vss_mean_found": _mean(column(found, "vss")),
         "add_recall_0.1d": _mean(add < 0.1 * diameter),
         "adi_recall_0.1d": _mean(adi < 0.1 * diameter),
         "add_s_recall_0.1d": _mean(np.where(symmetric, adi, add) < 0.1 * diameter),
         "add_auc_100mm": _auc(add),
         "adi_auc_100mm": _auc(adi),
-        "5cm5deg": _mean((column(rows, "te_m") < 0.05) & (re_sym_deg < 5.0)),
-        "proj_5px": _mean(column(rows, "proj_sym_px") < 5.0),
-        "ar_mssd": _mean(column(rows, "mssd_m")[:, None] < MSSD_DIAMETERS * diameter[:, None]),
-        "ar_mspd": _mean(column(rows, "mspd_px")[:, None] < MSPD_PX * column(rows, "image_width_px")[:, None] / 640),
-        "diverged": _mean(diverged(rows)),
+        "5cm5deg": _mean((column(table, "te_m") < 0.05) & (re_sym_deg < 5.0)),
+        "proj_5px": _mean(column(table, "proj_sym_px") < 5.0),
+        "ar_mssd": _mean(column(table, "mssd_m")[:, None] < MSSD_DIAMETERS * diameter[:, None]),
+        "ar_mspd": _mean(column(table, "mspd_px")[:, None] < MSPD_PX * column(table, "image_width_px")[:, None] / 640),
+        "diverged": _mean(diverged(table)),
     }
     for name, values in found_errors(found).items():
         result[f"{name}_mean"], result[f"{name}_median"] = _mean(values), _median(values)
@@ -70,7 +70,7 @@ def scores(rows: Sequence[Row]) -> dict[str, Any]:
     return result
 
 
-def found_errors(found: Sequence[Row]) -> dict[str, Float[Array, " n"]]:
+def found_errors(found: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     """Errors of found rows by name: degrees and millimetres, translations per camera axis without sign."""
     return {
         "re_deg": np.rad2deg(column(found, "re_rad")),
@@ -84,21 +84,19 @@ def found_errors(found: Sequence[Row]) -> dict[str, Float[Array, " n"]]:
     }
 
 
-def diverged(rows: Sequence[Row]) -> Bool[Array, " n"]:
+def diverged(table: pd.DataFrame) -> Bool[Array, " n"]:
     """Rows that are missing, rotated by over 45 degrees or moved by over half a diameter."""
-    rotated = column(rows, "re_sym_rad") > DIVERGED_RAD + ROUNDING_RAD
-    moved = column(rows, "te_m") > DIVERGED_DIAMETERS * column(rows, "diameter_m") + ROUNDING_M
-    return np.asarray(rotated | moved | (column(rows, "found") == 0))
+    rotated = column(table, "re_sym_rad") > DIVERGED_RAD + ROUNDING_RAD
+    moved = column(table, "te_m") > DIVERGED_DIAMETERS * column(table, "diameter_m") + ROUNDING_M
+    return np.asarray(rotated | moved | (column(table, "found") == 0))
 
 
-def by_object(rows: Sequence[Row]) -> dict[int, dict[str, Any]]:
+def by_object(table: pd.DataFrame) -> dict[int, dict[str, Any]]:
     """Scores of each object."""
-    return {
-        obj_id: scores([row for row in rows if row.obj_id == obj_id]) for obj_id in sorted({row.obj_id for row in rows})
-    }
+    return {int(obj_id): scores(group) for obj_id, group in table.groupby("obj_id")}
 
 
-def by_level(rows: Sequence[Row]) -> dict[str, list[dict[str, Any]]]:
+def by_level(table: pd.DataFrame) -> dict[str, list[dict[str, Any]]]:
     """Scores along the levels of perturbation.
 
     Returns:
@@ -106,22 +104,19 @@ def by_level(rows: Sequence[Row]) -> dict[str, list[dict[str, Any]]]:
         (degrees or diameters), `expected`, `under_5deg` and so on (share of rotation errors), `diverged`, means of the
         final errors.
     """
-    angles = [row for row in rows if row.start_translation_diameter == 0]
-    moves = [row for row in rows if row.start_angle_deg == 0]
     curves = {
-        "angle": _curve(angles, lambda row: row.start_angle_deg),
-        "translation": _curve(moves, lambda row: row.start_translation_diameter),
+        "angle": _curve(table[table.start_translation_diameter == 0], "start_angle_deg"),
+        "translation": _curve(table[table.start_angle_deg == 0], "start_translation_diameter"),
     }
     return {name: curve for name, curve in curves.items() if any(point["level"] > 0 for point in curve)}
 
 
-def _curve(rows: Sequence[Row], level_of: Callable[[Row], float]) -> list[dict[str, Any]]:
+def _curve(table: pd.DataFrame, level_column: str) -> list[dict[str, Any]]:
     curve = []
-    for level in sorted({level_of(row) for row in rows}):
-        group = [row for row in rows if level_of(row) == level]
+    for level, group in table.groupby(level_column):
         re_deg = np.rad2deg(column(group, "re_sym_rad"))
         te = column(group, "te_m")
-        point = {"level": level, "expected": len(group), "found": int(np.isfinite(te).sum())}
+        point = {"level": float(level), "expected": len(group), "found": int(np.isfinite(te).sum())}
         point |= {f"under_{limit:g}deg": _mean(re_deg < limit - np.rad2deg(ROUNDING_RAD)) for limit in LEVEL_LIMITS_DEG}
         point["te_under_0.1d"] = _mean(te < 0.1 * column(group, "diameter_m") - ROUNDING_M)
         point["diverged"] = _mean(diverged(group))

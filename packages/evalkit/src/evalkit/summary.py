@@ -2,20 +2,20 @@
 
 import platform
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from posecore.bop import BopDataset
 from posecore.files import sha256_bytes, sha256_file
 
 from evalkit import __version__
-from evalkit.evaluate import Row, VssKind, column
-from evalkit.files import ResultFile
-from evalkit.pairing import Pair
+from evalkit.evaluate import VssKind
+from evalkit.scored import CaseKey, Scored
 from evalkit.scores import DEFINITIONS, by_level, by_object, found_errors, scores
+from evalkit.table import column
 
 VSS_DEFINITIONS = {
     "full": "full: whole silhouettes rendered at both poses, occluders ignored (1 - cus of bop_toolkit)",
@@ -30,31 +30,6 @@ COMPARED = {
 }
 NO_ERROR = 1e-4
 """Degrees and millimetres: a result file's nine decimals lie below."""
-CaseKey = tuple[int, int, int, float, float, int]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Scored:
-    """A result file with its pairs and their errors, in the same order."""
-
-    file: ResultFile
-    pairs: list[Pair]
-    rows: list[Row]
-    ignored: int
-
-    def cases(self) -> dict[CaseKey, int]:
-        """Index of each pair under a key that other result files share."""
-        seen: dict[tuple[int, int, int, float, float], int] = {}
-        index_of: dict[CaseKey, int] = {}
-        for index, row in enumerate(self.rows):
-            level = (
-                np.nan_to_num(row.start_angle_deg, nan=-1.0),
-                np.nan_to_num(row.start_translation_diameter, nan=-1.0),
-            )
-            key = (row.scene_id, row.im_id, row.gt_index, float(level[0]), float(level[1]))
-            seen[key] = seen.get(key, 0) + 1
-            index_of[(*key, seen[key])] = index
-        return index_of
 
 
 def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> dict[str, Any]:
@@ -89,9 +64,9 @@ def _file_summary(item: Scored) -> dict[str, Any]:
         "is_start": item.file.is_start,
         "sidecar": sidecar,
         "ignored_lines": item.ignored,
-        "total": scores(item.rows),
-        "by_object": {str(obj_id): values for obj_id, values in by_object(item.rows).items()},
-        "by_level": by_level(item.rows),
+        "total": scores(item.table),
+        "by_object": {str(obj_id): values for obj_id, values in by_object(item.table).items()},
+        "by_level": by_level(item.table),
     }
 
 
@@ -104,27 +79,25 @@ def start_of(item: Scored, starts: Sequence[Scored]) -> Scored:
 def against_start(start: Scored, other: Scored) -> dict[str, Any]:
     """Medians of a file and of its start poses over the poses found in both, their ratios, and this in words."""
     start_cases, other_cases = start.cases(), other.cases()
-    both = [
-        (start.rows[start_cases[key]], other.rows[other_cases[key]])
-        for key in other_cases
-        if key in start_cases and other.rows[other_cases[key]].found and start.rows[start_cases[key]].found
-    ]
-    before, after = [row for row, _ in both], [row for _, row in both]
+    rows = np.array([(start_cases[key], row) for key, row in other_cases.items() if key in start_cases], np.int64)
+    before, after = start.table.iloc[rows.reshape(-1, 2)[:, 0]], other.table.iloc[rows.reshape(-1, 2)[:, 1]]
+    both = before.found.to_numpy() & after.found.to_numpy()
+    before, after = before[both], after[both]
     medians = {name: _medians(name, before, after) for name in COMPARED}
     vss_mean = {"start": _mean_vss(before), "refined": _mean_vss(after)}
-    missing = sum(not row.found for row in other.rows)
+    missing = int((~other.table.found).sum())
     return {
         "name": other.file.name,
         "start": start.file.name,
-        "poses": len(both),
+        "poses": len(after),
         "missing": missing,
         "medians": medians,
         "vss_mean": vss_mean,
-        "words": _words(other.file.name, start.file.name, len(both), missing, medians, vss_mean),
+        "words": _words(other.file.name, start.file.name, len(after), missing, medians, vss_mean),
     }
 
 
-def _medians(name: str, before: Sequence[Row], after: Sequence[Row]) -> dict[str, float]:
+def _medians(name: str, before: pd.DataFrame, after: pd.DataFrame) -> dict[str, float]:
     """Medians over the poses whose start has an error of this kind: curves also hold starts that are only moved."""
     old, new = found_errors(before)[name], found_errors(after)[name]
     off = old > NO_ERROR
@@ -134,8 +107,8 @@ def _medians(name: str, before: Sequence[Row], after: Sequence[Row]) -> dict[str
     return {"poses": int(off.sum()), "start": start, "refined": refined, "ratio": refined / start}
 
 
-def _mean_vss(rows: Sequence[Row]) -> float:
-    return float(column(rows, "vss").mean()) if rows else float("nan")
+def _mean_vss(table: pd.DataFrame) -> float:
+    return float(column(table, "vss").mean()) if len(table) else float("nan")
 
 
 def _words(
@@ -175,15 +148,16 @@ def worst_cases(scored: Sequence[Scored], count: int) -> list[CaseKey]:
     """Keys of the lowest VSS among the found poses of the last result file, lowest first."""
     if not scored:
         return []
-    rows = scored[-1].rows
-    found = [(key, index) for key, index in scored[-1].cases().items() if rows[index].found]
-    ordered = sorted(found, key=lambda item: (rows[item[1]].vss, -rows[item[1]].re_sym_rad))
+    table = scored[-1].table
+    vss, angle = column(table, "vss"), column(table, "re_sym_rad")
+    found = [(key, row) for key, row in scored[-1].cases().items() if table.found.iloc[row]]
+    ordered = sorted(found, key=lambda item: (vss[item[1]], -angle[item[1]]))
     return [key for key, _ in ordered[:count]]
 
 
-def visibility_bins(rows: Sequence[Row], edges: Sequence[float]) -> list[tuple[float, float, int]]:
+def visibility_bins(table: pd.DataFrame, edges: Sequence[float]) -> list[tuple[float, float, int]]:
     """Centre, mean VSS and number of rows for each bin of the visible share; empty bins are left out."""
-    visible, vss = column(rows, "visib_fract"), column(rows, "vss")
+    visible, vss = column(table, "visib_fract"), column(table, "vss")
     bins = []
     for low, high in pairwise(edges):
         inside = (visible >= low) & ((visible < high) | ((high == edges[-1]) & (visible <= high)))

@@ -104,10 +104,8 @@ class ShardReader:
                 digest.update(data)
             values[name] = self._decode(table[name], shard_id, data)
         if fields is None and digest.hexdigest() != line.get("sha256"):
-            raise ShardError(
-                f"{self.url}: shard {shard_id} differs from its checksum in {MANIFEST}; the shard is damaged: "
-                "delete its line and run the same `synthgen render` again"
-            )
+            first = shard_key(next(iter(table.values())), shard_id)
+            raise self._changed(first, f"shard {shard_id} differs from its checksum in {MANIFEST}")
         return values
 
     def _field_bytes(self, field: Field, shard_id: int, line: Mapping[str, Any]) -> bytes:
@@ -115,7 +113,10 @@ class ShardReader:
         data, expected = self._store.get(key), line["bytes"].get(field.name)
         if data is None or len(data) != expected:
             found = "no file" if data is None else f"{len(data)} bytes"
-            raise self._damaged(shard_id, f"{key}: found {found}, expected {expected} bytes")
+            raise ShardError(
+                f"{self.url}/{key}: found {found}, expected {expected} bytes; the shard is damaged: run the same "
+                "`synthgen render` again, which renders damaged shards anew"
+            )
         return data
 
     def _decode(self, field: Field, shard_id: int, data: bytes) -> Array:
@@ -125,13 +126,12 @@ class ShardReader:
             try:
                 stored = files.unpack(data, field.codec, field.dtype, (chunk, *size), self.shard_size, first)
             except (ValueError, RuntimeError) as error:
-                what = f"{shard_key(field, shard_id)}: does not decode ({error})"
-                raise self._damaged(shard_id, what) from error
+                raise self._changed(shard_key(field, shard_id), f"does not decode ({error})") from error
             field.decode(stored[: len(values) - first], self.card, values[first : first + chunk])
         return values
 
-    def _damaged(self, shard_id: int, what: str) -> ShardError:
+    def _changed(self, key: str, what: str) -> ShardError:
         return ShardError(
-            f"{self.url}/{what}; the shard is damaged: delete its line (shard {shard_id}) from {MANIFEST} and run the "
-            "same `synthgen render` again"
+            f"{self.url}/{key}: {what}; the shard is damaged: delete this file and run the same `synthgen render` "
+            "again, which renders shards anew that miss one"
         )

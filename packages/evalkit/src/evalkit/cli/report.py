@@ -1,0 +1,75 @@
+"""`evalkit report`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+from posecore.bop import BopDataset
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from evalkit.cli.options import FOLDER, split_option
+from evalkit.evaluate import VssKind
+from evalkit.files import dataset_of, find_result_files
+from evalkit.report import write_report
+
+
+@click.command()
+@click.option("--dataset", type=FOLDER, help="BOP dataset folder. Default: the one the results' sidecars name.")
+@click.option(
+    "--results", multiple=True, type=FOLDER, help="BOP result file; repeat it to compare. Default: all with a sidecar."
+)
+@click.option("--out", type=FOLDER, default=Path("report"), show_default=True, help="Folder for the report.")
+@split_option
+@click.option(
+    "--vss",
+    type=click.Choice(["full", "visible"]),
+    default="full",
+    show_default=True,
+    help="Whole silhouettes, or their visible parts (needs depth images).",
+)
+@click.option("--worst", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of worst cases.")
+def report(
+    dataset: Path | None, results: tuple[Path, ...], out: Path, split: str | None, vss: VssKind, worst: int
+) -> None:
+    """Write a report: one HTML page, a CSV line for each pose, a JSON summary.
+
+    Without options, it takes the result files (*.csv with *.csv.json beside it) in this folder and in results/, and
+    the dataset that their sidecars name.
+
+    \b
+    Examples:
+      evalkit report
+      evalkit report --dataset lmo --results start.csv --results refined.csv --out report
+    """
+    here = Path()
+    paths = list(results) or find_result_files(here)
+    opened = BopDataset(dataset or dataset_of(paths, here), split)
+    with _progress() as progress:
+
+        def start(name: str, total: int) -> Callable[[int], None]:
+            task = progress.add_task(name, total=total)
+            return lambda done: progress.advance(task, done)
+
+        written = write_report(opened, paths, out, vss=vss, worst=worst, start=start)
+    for item in written.summary["against_start"]:
+        click.echo(item["words"])
+    for file in written.summary["files"]:
+        click.echo(_total_line(file))
+    click.echo(f"Report: {written.page}")
+
+
+def _progress() -> Progress:
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+
+
+def _total_line(file: dict[str, Any]) -> str:
+    total = file["total"]
+    missing = f", {total['missing']} missing" if total["missing"] else ""
+    return (
+        f"{file['name']}: {total['expected']} poses{missing}, VSS {total['vss_mean']:.3f}, "
+        f"ADD(-S) at 0.1 diameter {100 * total['add_s_recall_0.1d']:.1f} %"
+    )
