@@ -141,11 +141,13 @@ def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     maker.close()
     start, span = -(-100 // h), max(1, scenes // 10)
     early, late = seconds[start : start + span], seconds[-span:]
+    tenths = [seconds[i : i + span] for i in range(0, scenes - span + 1, span)]
     return {
         "scenes": scenes,
         "pairs": scenes * h,
         "scene_ms_from_pair_100": round(1e3 * statistics.median(early), 2),
         "scene_ms_at_the_end": round(1e3 * statistics.median(late), 2),
+        "scene_ms_by_tenth": [round(1e3 * statistics.median(part), 2) for part in tenths],
         "end_over_start": round(statistics.median(late) / statistics.median(early), 3),
         "memory_growth_mb_from_pair_100": round((rss[-1] - rss[start]) / 1e6, 1),
     }

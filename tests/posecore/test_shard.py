@@ -1,7 +1,6 @@
 """Shard datasets: round trip within the stated quantisation, commits, damage and foreign data."""
 
 import json
-import pickle
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import zarr
 from numcodecs import blosc
 from posecore import shard
 from posecore.errors import ShardError, StorageError
-from posecore.shard.memory import Recycler
 
 CARD = {"n": 10, "shard_size": 4, "patch_px": 16, "contour_points": 5, "depth_step_m": 1e-4, "seed": 3}
 
@@ -210,7 +208,7 @@ def test_files_that_decode_but_are_not_the_shards_own_are_refused(tmp_path: Path
     line["sha256"] = json.loads(manifest[0])["sha256"]
     (tmp_path / "d/manifest.jsonl").write_text("\n".join([manifest[0], json.dumps(line), manifest[2]]) + "\n")
     reader = shard.ShardReader(str(tmp_path / "d"))
-    with pytest.raises(ShardError, match="shard 1 differs from its checksum"):
+    with pytest.raises(ShardError, match=r"shard 1 differs from its checksum.*delete this file and run the same"):
         reader.read(1)
     reader.read(0)
 
@@ -243,52 +241,3 @@ def test_a_flipped_bit_is_found_when_few_fields_are_read(tmp_path: Path) -> None
     with pytest.raises(ShardError, match=r"scene_mask/c/1/0/0: does not decode \(checksum differs\).*shard is damaged"):
         shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_mask"])
     shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_rgb"])
-
-
-def test_memory_is_used_again_only_when_nobody_can_see_it() -> None:
-    recycler, shape, kind = Recycler(), (2**18,), np.dtype(np.float32)
-    first = recycler.empty(shape, kind)
-    first[:] = 1
-    second = recycler.empty(shape, kind)
-    assert not np.shares_memory(first, second)
-    place, view = first.ctypes.data, first[5:7]
-    del first
-    third = recycler.empty(shape, kind)
-    third[:] = 3
-    assert view.tolist() == [1, 1]
-    del view
-    assert recycler.empty(shape, kind).ctypes.data == place
-    assert recycler.empty((4,), kind).shape == (4,) and recycler.empty(shape, np.dtype(np.int32)).dtype == np.int32
-    assert pickle.loads(pickle.dumps(recycler)).empty(shape, kind).ctypes.data != place
-
-
-def test_what_was_read_stays_as_it_was(tmp_path: Path) -> None:
-    """Arrays of one shard are not filled with the next one while a sample of them is in use."""
-    card = {**CARD, "n": 8, "patch_px": 256}
-    writer = shard.ShardWriter.create(str(tmp_path / "d"), card)
-    for i in range(2):
-        arrays = {f.name: np.full((4, *f.size(256, 5)), i) for f in shard.field_table()}
-        writer.commit(writer.encode(i, arrays))
-    reader = shard.ShardReader(str(tmp_path / "d"))
-    kept = {name: values[2] for name, values in reader.read(0).items()}
-    for _ in range(3):
-        assert all((values == 1).all() for name, values in reader.read(1).items() if not name.endswith("depth_m"))
-    assert all((values == 0).all() for values in kept.values())
-
-
-def test_values_out_of_range_and_missing_fields_are_refused(tmp_path: Path) -> None:
-    writer = shard.ShardWriter.create(str(tmp_path / "d"), CARD)
-    arrays = samples(4, 0)
-    with pytest.raises(ShardError, match="scene_depth_m: values from"):
-        writer.encode(0, {**arrays, "scene_depth_m": np.full((4, 16, 16), 7.0)})
-    with pytest.raises(ShardError, match="hypothesis_depth_m: values from nan"):
-        writer.encode(0, {**arrays, "hypothesis_depth_m": np.full((4, 16, 16), np.nan)})
-    for wrong in (0.5, -1.0, np.nan, 70_000.0):
-        distance = arrays["scene_distance_px"].copy()
-        distance[2, 3, 4] = wrong
-        with pytest.raises(ShardError, match=r"scene_distance_px: values from .* squares are whole numbers"):
-            writer.encode(0, {**arrays, "scene_distance_px": distance})
-    with pytest.raises(ShardError, match="K_crop: found nothing"):
-        writer.encode(0, {k: v for k, v in arrays.items() if k != "K_crop"})
-    with pytest.raises(ShardError, match="obj_id: found"):
-        writer.encode(0, {**arrays, "obj_id": np.zeros(3, np.int32)})

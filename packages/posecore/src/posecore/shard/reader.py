@@ -12,7 +12,6 @@ from posecore.errors import ShardError
 from posecore.shard import files
 from posecore.shard.fields import Field, field_table
 from posecore.shard.group import GROUP, MANIFEST, chunk_shape, n_shards, read_card, read_manifest, samples_in, shard_key
-from posecore.shard.memory import Recycler
 from posecore.store import open_store
 
 Array = np.ndarray
@@ -35,7 +34,6 @@ class ShardReader:
                 f"{self.url}: no {GROUP} here, so this is no shard dataset; make one with `synthgen render`"
             )
         self.card = read_card(self.url, group)
-        self._memory = Recycler()
         self.refresh()
 
     def refresh(self) -> None:
@@ -121,7 +119,7 @@ class ShardReader:
 
     def _decode(self, field: Field, shard_id: int, data: bytes) -> Array:
         chunk, *size = chunk_shape(field, self.card)
-        values = self._memory.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
+        values = np.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
         for first in range(0, len(values), chunk):
             try:
                 stored = files.unpack(data, field.codec, field.dtype, (chunk, *size), self.shard_size, first)
