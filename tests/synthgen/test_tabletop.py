@@ -1,11 +1,13 @@
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from blender_scenes import MATT, at, box, scene_of
 from posecore.camera import Camera, back_project, intrinsics
 from posecore.se3 import apply, inverse
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT
 from synthgen.assets import Assets
 from synthgen.config import TabletopConfig
 from synthgen.dataset import depth_step_m
@@ -137,7 +139,6 @@ def test_objects_of_about_one_size_share_their_tables_and_scenes_stay_in_the_ran
 
 
 def test_tables_are_cut_from_photographs_where_there_are_some(tmp_path):
-    import cv2
 
     cv2.imwrite(str(tmp_path / "red.png"), np.full((64, 64, 3), (0, 0, 250), np.uint8))
     tables = tabletop.tables(TabletopConfig(tables=12), 0, 0.1, (str(tmp_path / "red.png"),))
@@ -208,3 +209,20 @@ def test_a_box_on_a_table_throws_a_shadow_that_starts_at_its_foot(name):
 
     assert at_table(-0.05, -0.01) > 3 * at_table(0.04, -0.01)
     assert at_table(0.04, -0.01) < 0.4 * at_table(0.09, -0.01)
+
+
+def test_labels_have_no_gap_between_object_and_table(tug, config_of):
+    """Also where the camera's pixels are coarser than the patch's, so that its layers show the object too large."""
+    steep = ("tabletop.elevation_deg=[70, 70]", "tabletop.size_diameter=[30, 30]", "tabletop.distractors=[0, 0]")
+    far = ("distance.min=20", "distance.max=20", "patch_px=96")
+    config = config_of(*TABLETOP, *steep, *far)
+    maker = PairMaker(config, make_targets({1: tug}, config))
+    assert maker.targets[0].window_side_px < 0.75 * config.patch_px
+    for index in range(3):
+        values = maker.samples(index, 1)
+        silhouette = (values["scene_mask"][0] & BIT_OBJECT) > 0
+        ring = (cv2.dilate(silhouette.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0) & ~silhouette
+        assert ring.sum() > 100
+        assert (values["scene_depth_m"][0][ring] > 0).all()
+        assert ((values["scene_mask"][0][ring] & BIT_FOREGROUND) > 0).all()
+    maker.close()
