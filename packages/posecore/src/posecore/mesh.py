@@ -194,8 +194,8 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
     if low <= diameter_m <= high:
         return
     fits = [u for u, s in METRES_PER_UNIT.items() if low <= diameter_m / METRES_PER_UNIT[units] * s <= high]
-    best = [u for u in ("m", "cm", "mm") if u in fits]
-    hint = f"; did you mean --units {best[0]}?" if best else "; check the mesh's scale"
+    meant = [f"--units {u} ({diameter_m / METRES_PER_UNIT[units] * METRES_PER_UNIT[u] * 1e3:.4g} mm)" for u in fits]
+    hint = f"; did you mean {' or '.join(meant)}?" if meant else "; check the mesh's scale"
     raise MeshError(
         f"{file}: the diameter is {diameter_m * 1e3:.6g} mm when read in {units}, "
         f"expected {low * 1e3:g} mm to {high:g} m{hint}"

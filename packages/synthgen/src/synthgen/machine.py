@@ -81,3 +81,9 @@ def _text(file: Path) -> str:
         return file.read_text(encoding="utf-8").strip()
     except OSError:
         return ""
+
+
+def size_text(size_bytes: float) -> str:
+    """A size in words: 940 kB, 1.2 MB, 23.6 GB."""
+    unit, factor = next((u, f) for u, f in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)) if size_bytes >= f or u == "kB")
+    return f"{size_bytes / factor:.3g} {unit}"

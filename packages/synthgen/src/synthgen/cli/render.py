@@ -161,12 +161,13 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     from posecore.errors import RenderError
 
     from synthgen import dataset
+    from synthgen.machine import size_text
     from synthgen.run.estimate import check_free_space, estimate
 
     if missing < MEASURED_FROM:
         size = dataset.estimated_bytes(job.config, missing)
         check_free_space(out, size)
-        return f"about {size / 1e9:.2g} GB more"
+        return f"about {size_text(size)} more"
     try:
         found = estimate(job)
     except RenderError as error:  # one scene may be to blame, or this machine only gives orders: the workers will see
@@ -174,7 +175,7 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     size = found.bytes(missing)
     check_free_space(out, size)
     time = "" if workers is None else f" and {_duration(found.seconds(missing, workers))}"
-    return f"about {size / 1e9:.2g} GB{time} more, judged by {found.pairs} pairs"
+    return f"about {size_text(size)}{time} more, judged by {found.pairs} pairs"
 
 
 def _duration(seconds: float) -> str:

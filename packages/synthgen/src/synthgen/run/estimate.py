@@ -11,7 +11,7 @@ from pathlib import Path
 from posecore import shard
 from posecore.errors import PoseError, RenderError, StorageError
 
-from synthgen.machine import free_bytes
+from synthgen.machine import free_bytes, size_text
 from synthgen.pair import concatenate
 from synthgen.run.processes import die_with_parent
 from synthgen.run.shardrun import ShardJob, ShardRenderer, scenes_in
@@ -96,13 +96,9 @@ def check_free_space(url: str, needed_bytes: int) -> None:
     free = free_bytes(Path(url))
     if free < needed_bytes + _SPARE_BYTES:
         raise StorageError(
-            f"{url}: {_gigabytes(free)} free, about {_gigabytes(needed_bytes + _SPARE_BYTES)} needed; free some space, "
+            f"{url}: {size_text(free)} free, about {size_text(needed_bytes + _SPARE_BYTES)} needed; free some space, "
             "choose another --out, or a smaller --n"
         )
-
-
-def _gigabytes(size: int) -> str:
-    return f"{size / 1e9:.3g} GB"
 
 
 def main() -> None:
