@@ -1,0 +1,126 @@
+"""The whole recipe of a dataset, and how it is put together from presets and overrides."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from posecore import config as config_tools
+from posecore.errors import ConfigError
+from posecore.files import data_spec
+
+from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
+from synthgen.config.images import FrameConfig, SequenceConfig
+from synthgen.config.ranges import check
+from synthgen.config.surroundings import (
+    BackgroundConfig,
+    LightConfig,
+    MaterialConfig,
+    OccluderConfig,
+    SceneConfig,
+    SensorConfig,
+    TabletopConfig,
+)
+from synthgen.engine import Device, EngineName
+
+MAX_PATCH_PX = 362  # shards hold distances up to 512 px, which is this patch's diagonal
+
+
+@dataclass(frozen=True, kw_only=True)
+class SynthConfig:
+    """A dataset's whole recipe; with the object and the number of samples it decides every byte.
+
+    Attributes:
+        seed: Dataset seed.
+        engine: Renderer of the scenes.
+        hypothesis_engine: Renderer of the hypothesis patches; the rasteriser is what inference uses.
+        device: Where Cycles traces.
+        samples: Light paths per pixel of the Blender engines.
+        patch_px: Side of the patches.
+        contour_points: Contour points per silhouette.
+        hypotheses_per_scene: Hypotheses that share one rendered scene.
+        shard_size: Samples in a shard: the unit of work and of resuming. A multiple of `hypotheses_per_scene`.
+        camera: Intrinsics.
+        distance: Distance of the object.
+        view: Viewpoint and place in the image.
+        perturbation: Distance of the hypotheses from the truth.
+        window: Fixed window.
+        scene: Kinds of scene.
+        tabletop: Scenes on a table.
+        lights: Lamps.
+        material: The object's surface.
+        occluders: Shapes around it.
+        background: What lies behind.
+        sensor: Camera effects.
+        frames: Whole camera images.
+        sequence: Motion of tracking sequences.
+    """
+
+    seed: int = 0
+    engine: EngineName = "cycles"
+    hypothesis_engine: EngineName = "raster"
+    device: Device = "cpu"
+    samples: int = 16
+    patch_px: int = 224
+    contour_points: int = 100
+    hypotheses_per_scene: int = 8
+    shard_size: int = 64
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    distance: DistanceConfig = field(default_factory=DistanceConfig)
+    view: ViewConfig = field(default_factory=ViewConfig)
+    perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    tabletop: TabletopConfig = field(default_factory=TabletopConfig)
+    lights: LightConfig = field(default_factory=LightConfig)
+    material: MaterialConfig = field(default_factory=MaterialConfig)
+    occluders: OccluderConfig = field(default_factory=OccluderConfig)
+    background: BackgroundConfig = field(default_factory=BackgroundConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    frames: FrameConfig = field(default_factory=FrameConfig)
+    sequence: SequenceConfig = field(default_factory=SequenceConfig)
+
+    def __post_init__(self) -> None:
+        check("seed", self.seed, 0, 2**63 - 1)
+        check("samples", self.samples, 1, 65536)
+        check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
+        check("contour_points", self.contour_points, 1, 100_000)
+        check("hypotheses_per_scene", self.hypotheses_per_scene, 1, 4096)
+        check("shard_size", self.shard_size, 1, 1_000_000)
+        if self.shard_size % self.hypotheses_per_scene:
+            near = max(1, round(self.shard_size / self.hypotheses_per_scene)) * self.hypotheses_per_scene
+            raise ConfigError(
+                f"shard_size is {self.shard_size}, expected a multiple of hypotheses_per_scene "
+                f"({self.hypotheses_per_scene}) because a scene lives in one shard; try shard_size={near}"
+            )
+
+
+def preset_names() -> list[str]:
+    """Names of the shipped presets."""
+    return sorted(p.stem for p in data_spec("presets").glob("*.yaml"))
+
+
+def load_config(
+    preset: str = "default", overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None
+) -> SynthConfig:
+    """Resolve a preset, `key=value` overrides and option values (in rising priority) to a configuration.
+
+    Args:
+        preset: Name of a shipped preset, or a YAML file.
+        overrides: Assignments such as `window.padding=0.5`.
+        values: Top-level values from command-line options; None entries are left out.
+
+    Raises:
+        ConfigError: Unknown preset, key or value; the message names it.
+    """
+    if preset.endswith((".yaml", ".yml")) or Path(preset).is_file():
+        where, mapping = preset, config_tools.load_yaml(preset)
+    elif preset in preset_names():
+        where, mapping = f"preset {preset}", config_tools.load_yaml(data_spec(f"presets/{preset}.yaml"))
+    else:
+        raise ConfigError(
+            f"--preset {preset}: there is no such preset; choose one of {', '.join(preset_names())} or a .yaml file"
+        )
+    mapping = config_tools.apply_overrides(mapping, overrides)
+    mapping.update({k: v for k, v in (values or {}).items() if v is not None})
+    return config_tools.build(SynthConfig, mapping, where)
