@@ -109,7 +109,9 @@ def test_a_texture_seam_does_not_smear(tmp_path: Path) -> None:
 
 def test_metres_read_as_mm_are_refused_with_the_hint(tmp_path: Path) -> None:
     file = write_box(tmp_path / "box.ply", (0.06, 0.04, 0.03))
-    with pytest.raises(MeshError, match=r"box.ply: the diameter is 0.0781.* mm when read in mm.*--units m \(78.1 mm\)\?"):
+    with pytest.raises(
+        MeshError, match=r"box.ply: the diameter is 0.0781.* mm when read in mm.*--units m \(78.1 mm\)\?"
+    ):
         load_mesh(file)
     assert load_mesh(file, units="m").diameter_m == pytest.approx(0.0781, abs=1e-4)
 
