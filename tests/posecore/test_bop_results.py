@@ -7,7 +7,18 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from posecore import se3
-from posecore.bop import Estimate, read_results, read_sidecar, sidecar_path, write_results
+from posecore.bop import (
+    BopDataset,
+    Estimate,
+    ResultTable,
+    read_result_table,
+    read_results,
+    read_sidecar,
+    sidecar_path,
+    table_of,
+    write_results,
+)
+from posecore.bop.result_table import COLUMNS, parse_results
 from posecore.errors import DatasetError, ResultFileError
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
@@ -88,10 +99,18 @@ def test_metres_are_suspected(tmp_path):
         read_results(path)
 
 
-@pytest.mark.parametrize("text", ["", HEADER, f"{HEADER}\n\n"])
-def test_no_results(tmp_path, text):
+@pytest.mark.parametrize("text", [HEADER, f"{HEADER}\n\n", f"\n {HEADER} \r\n"])
+def test_a_header_alone_is_a_file_without_estimates(tmp_path, text):
     path = tmp_path / "r.csv"
     path.write_text(text)
+    assert read_results(path) == []
+    assert len(read_result_table(path)) == 0
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "\ufeff", " \x1c\n"])
+def test_an_empty_file_is_refused(tmp_path, text):
+    path = tmp_path / "r.csv"
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(ResultFileError, match="no estimates"):
         read_results(path)
     with pytest.raises(ResultFileError, match="cannot be read"):
@@ -148,3 +167,138 @@ def test_any_estimate_survives_a_round_trip(tmp_path, seed, score, time_s):
     (after,) = read_results(path)
     assert np.abs(before.T_cam_obj - after.T_cam_obj).max() < 1e-9
     assert after.score == pytest.approx(score, rel=1e-8)
+
+
+def columns_of(table):
+    return {name: getattr(table, name) for name in ("scene_id", "im_id", "obj_id", "score", "T_cam_obj", "time_s")}
+
+
+def lines_of(count):
+    """Lines as methods write them: signs, exponents, many and few decimals."""
+    rng = np.random.default_rng(5)
+    lines = []
+    for index in range(count):
+        R = se3.random_rotation(rng).reshape(-1)
+        t = [*rng.normal(0, 100, 2), 400 + 600 * rng.random()]
+        formats = (".9f", ".17g", "+.12e", ".6g")
+        spec = formats[index % 4]
+        numbers = " ".join(format(value, spec) for value in R), " ".join(format(value, spec) for value in t)
+        lines.append(f"{index % 7},{index},{index % 3 + 1},{rng.random()!r},{numbers[0]},{numbers[1]},{index % 2 - 1}")
+    return lines
+
+
+def test_lines_read_all_at_once_give_the_floats_of_python(tmp_path):
+    """Twins: the fast reader and one line after the other agree to the last bit."""
+    lines = lines_of(400)
+    fast = parse_results("\n".join(lines).encode(), "r.csv")
+    slow = parse_results("\n".join(line.replace(",", "\t,") for line in lines).encode(), "r.csv")
+    for name, values in columns_of(fast).items():
+        assert np.array_equal(values, getattr(slow, name)), name
+    t_mm = [float(part) for part in lines[17].split(",")[5].split()]
+    assert np.array_equal(fast.T_cam_obj[17, :3, 3], np.array(t_mm) * 1e-3)
+    assert fast.line.tolist() == list(range(1, 401))
+
+
+def test_lines_keep_their_numbers_across_chunks(monkeypatch):
+    monkeypatch.setattr("posecore.bop.result_table.CHUNK_BYTES", 1000)
+    lines = [HEADER, *lines_of(60), "", *lines_of(3)]
+    table = parse_results("\r\n".join(lines).encode(), "r.csv")
+    assert table.line.tolist() == [*range(2, 62), 63, 64, 65]
+    lines[40] = lines[40].replace(",", ";", 1)
+    with pytest.raises(ResultFileError, match=r"^r.csv:41: found 6 fields"):
+        parse_results("\n".join(lines).encode(), "r.csv")
+
+
+def test_a_line_longer_than_a_chunk_is_read(monkeypatch):
+    monkeypatch.setattr("posecore.bop.result_table.CHUNK_BYTES", 50)
+    assert len(parse_results(f"{GOOD}\n{' ' * 500}{GOOD}\n{GOOD}".encode(), "r.csv")) == 3
+
+
+@pytest.mark.parametrize("order", [(6, 5, 4, 3, 2, 1, 0), (3, 0, 4, 1, 5, 2, 6)])
+@pytest.mark.parametrize("space", ["", " ", "\t"])
+def test_a_header_may_name_the_columns_in_another_order(order, space):
+    lines = lines_of(20)
+    header = f"{space},{space}".join(COLUMNS[i] for i in order)
+    moved = [",".join(line.split(",")[i] for i in order) for line in lines]
+    straight = parse_results("\n".join(lines).encode(), "r.csv")
+    table = parse_results("\n".join([space + header, *moved]).encode(), "r.csv")
+    for name, values in columns_of(straight).items():
+        assert np.array_equal(values, getattr(table, name)), name
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("scene_id,im_id,obj_id,score,R,t", "missing time, unknown none"),
+        ("scene_id,im_id,obj_id,score,R,t,runtime", "missing time, unknown runtime"),
+        ("scene_id,im_id,obj_id,obj_id,R,t,time", "missing score, unknown none, twice obj_id"),
+    ],
+)
+def test_another_header_is_refused_by_name(header, message):
+    with pytest.raises(ResultFileError, match=rf"^r.csv:1: the header is not .*: {message}"):
+        parse_results(f"{header}\n{GOOD}\n".encode(), "r.csv")
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 900,1_0", "time is '1_0'"),
+        ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,1\u0661 20 900,-1", "t is '1\u0661 20 900'"),
+        ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 9e99,-1", "t holds 9e+99 mm"),
+        ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 9e999,-1", "t holds NaN or infinity"),
+        ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20-900,-1", "t is '10 20-900'"),
+        ("1e0,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "scene_id is '1e0'"),
+        ("+1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "scene_id is '+1'"),
+        ("1,2,1234567890123456789,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "at most 18 digits"),
+        ("1,2,3,0.5 0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "score has 2 numbers"),
+        ("1,2,3,,1 0 0 0 1 0 0 0 1,10 20 900,-1", "score has 0 numbers"),
+        ("1,2,3,0.5,1e200 0 0 0 1e200 0 0 0 1e200,10 20 900,-1", "R is "),
+    ],
+)
+def test_what_a_lenient_reader_would_take_is_refused(line, message):
+    """Python reads underscores and other alphabets' digits, a fast reader two numbers in `20-900`."""
+    with pytest.raises(ResultFileError) as caught:
+        parse_results(f"{GOOD}\n{line}\n".encode(), "r.csv")
+    assert str(caught.value).startswith("r.csv:2: ")
+    assert message in str(caught.value)
+
+
+def test_large_ids_stay_exact():
+    """Beyond 2^53 a float would round them."""
+    line = GOOD.replace("1,2,3", "1,900719925474099312,3", 1)
+    assert parse_results(line.encode(), "r.csv").im_id.tolist() == [900719925474099312]
+
+
+def test_all_faults_are_told_and_the_good_lines_kept():
+    faults = []
+    text = "\n".join([GOOD, "1,2", GOOD.replace("0.5", "nan"), GOOD, GOOD.replace("1 0 0 0 1", "2 0 0 0 1")])
+    table = parse_results(text.encode(), "r.csv", faults.append)
+    assert table.line.tolist() == [1, 4]
+    assert [(fault.line, fault.field, fault.kind) for fault in faults] == [
+        (2, "line", "fields"),
+        (3, "score", "not finite"),
+        (5, "R", "rotation"),
+    ]
+
+
+def test_a_table_is_cut_and_joined():
+    table = table_of([estimate(seed) for seed in range(4)])
+    both = ResultTable.concat([table.take(np.array([3])), table.take(table.im_id < 2)])
+    assert both.im_id.tolist() == [3, 0, 1]
+    assert np.array_equal(both.T_cam_obj[0], estimate(3).T_cam_obj)
+    assert len(ResultTable.concat([])) == 0
+
+
+def test_unknown_ids_are_refused_with_the_first_line(shared_data, tmp_path):
+    dataset = BopDataset(shared_data / "lmo")
+    lines = (shared_data / "lmo/init_ssd6d-like_lmo-test.csv").read_text().splitlines()
+    for number, (change, message) in enumerate(
+        [(("2,3,", "9,3,"), "scene 9 is not in"), (("2,3,", "2,4,"), "image 4 has no ground truth in")]
+    ):
+        path = tmp_path / f"{number}.csv"
+        path.write_text("\n".join([*lines[:5], lines[5].replace(*change, 1), *lines[6:]]))
+        with pytest.raises(ResultFileError, match=rf"{number}.csv:6: {message}"):
+            read_result_table(path, dataset)
+    path.write_text("\n".join([*lines[:300], lines[300].replace(",1.0,", "3,1.0,", 1)]))
+    with pytest.raises(ResultFileError, match=r":301: object \d+ is unknown, lmo has 1, 5, 6"):
+        read_result_table(path, dataset)

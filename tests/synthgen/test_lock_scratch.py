@@ -24,7 +24,7 @@ def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):
 
 
 def test_the_lock_goes_with_a_killed_process(tmp_path):
-    code = f"import os, signal\nfrom synthgen import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
+    code = f"import os, signal\nfrom synthgen.run import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
     with lock.held(str(tmp_path)):
         pass
@@ -45,7 +45,7 @@ def test_a_sweep_removes_what_killed_processes_left_and_nothing_else(tmp_path, m
     (mine / "layers.exr").write_bytes(b"mine")
     (tmp_path / "synthgen_file").write_text("not a folder")
     code = (
-        "import os\nfrom pathlib import Path\nfrom synthgen import scratch\n"
+        "import os\nfrom pathlib import Path\nfrom synthgen.run import scratch\n"
         f"scratch._SHARED_MEMORY = Path({str(tmp_path)!r})\n"
         "folder, _ = scratch.make_folder()\n(folder / 'layers.exr').write_bytes(b'lost')\nos.kill(os.getpid(), 9)"
     )

@@ -96,7 +96,15 @@ def _chunks(symmetries: Float[Array, "s 4 4"], points: int) -> list[Float[Array,
 
 def re(T_est: Pose, T_gt: Pose) -> float:
     """Angle of the rotation between two poses, without symmetries, radians in [0, pi]."""
-    return float(se3.rotation_angle_rad(T_est[:3, :3] @ _inverse(T_gt[:3, :3])))
+    return float(_angle_rad(T_est[:3, :3], T_gt[:3, :3]))
+
+
+def _angle_rad(R_est: Float[Array, "3 3"], R_gt: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
+    """Angle of R_est R_gt^-1, exactly 0 where both are the same: only what differs from the identity is computed."""
+    D = (R_est - R_gt) @ _inverse(R_gt)
+    skew = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
+    cosine = 1.0 + np.trace(D, axis1=-2, axis2=-1) / 2.0
+    return np.asarray(np.arctan2(np.linalg.norm(skew, axis=-1) / 2.0, cosine))
 
 
 def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
@@ -109,7 +117,7 @@ def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
 def re_symmetric(T_est: Pose, T_gt: Pose, symmetries: Float[Array, "s 4 4"]) -> float:
     """The same angle at the best symmetry, radians."""
     true = T_gt[:3, :3] @ symmetries[:, :3, :3]
-    return float(se3.rotation_angle_rad(T_est[:3, :3] @ _inverse(true)).min())
+    return float(_angle_rad(T_est[:3, :3], true).min())
 
 
 def te(T_est: Pose, T_gt: Pose) -> float:

@@ -1,6 +1,7 @@
 """Start poses from ground truth: rotated and moved by known amounts, so that convergence can be drawn as a curve."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,49 @@ from posecore.errors import ConfigError
 from evalkit import __version__
 from evalkit.files import START_METHOD
 from evalkit.pairing import Level, truths_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Protocol:
+    """A published experiment: its levels, and what it asks of the refiner.
+
+    Attributes:
+        angles_deg: one start for each, not moved.
+        translations_diameter: one start for each, not rotated.
+        iterations: of the refiner.
+        source: where it is described.
+    """
+
+    angles_deg: tuple[float, ...]
+    translations_diameter: tuple[float, ...]
+    iterations: int
+    source: str
+
+
+PROTOCOLS: Mapping[str, Protocol] = {
+    "paper": Protocol(
+        angles_deg=(5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0),
+        translations_diameter=(0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0),
+        iterations=10,
+        source="Deep Model-Based 6D Pose Refinement in RGB, ECCV 2018, section 4.1 and figure 4",
+    )
+}
+"""The paper says 5 to 45 degrees and 0 to 1 diameters; the steps of 5 degrees and 0.1 diameters are ours."""
+
+
+def departures(sidecar: Mapping[str, Any]) -> list[str]:
+    """In what a result file from perturbed starts departs from their protocol, a sentence each; empty where in nothing.
+
+    Args:
+        sidecar: of the refined file, which carries the starts' `perturbation`.
+    """
+    perturbation, settings = sidecar.get("perturbation"), sidecar.get("settings")
+    name = perturbation.get("protocol") if isinstance(perturbation, dict) else None
+    protocol = PROTOCOLS.get(name) if isinstance(name, str) else None
+    iterations = settings.get("iterations") if isinstance(settings, dict) else None
+    if protocol is None or iterations is None or iterations == protocol.iterations:
+        return []
+    return [f"refined in {iterations} iterations, while protocol '{name}' asks for {protocol.iterations}"]
 
 
 def levels_of(angles_deg: Sequence[float], translations_diameter: Sequence[float]) -> list[Level]:
@@ -36,6 +80,7 @@ def perturb_dataset(
     levels: Sequence[Level],
     seed: int,
     random_up_to: Level | None = None,
+    protocol: str | None = None,
 ) -> int:
     """Write start poses for every target, and in the sidecar the level of every line.
 
@@ -48,6 +93,7 @@ def perturb_dataset(
         levels: levels for every target, one line each.
         seed: of all draws.
         random_up_to: where given, one more line for each target, its angle and length drawn evenly from 0 up to these.
+        protocol: name of the `PROTOCOLS` entry that the levels are of, for the sidecar.
 
     Returns:
         Number of lines.
@@ -56,7 +102,9 @@ def perturb_dataset(
         ConfigError: neither levels nor random ones are wanted.
     """
     if not levels and random_up_to is None:
-        raise ConfigError("no levels: give --angles 5,10,15 or --translations 0.1,0.2 or --random-up-to 20")
+        raise ConfigError(
+            "no levels: give --angles 5,10,15 or --translations 0.1,0.2 or --random-up-to 20 or --protocol paper"
+        )
     estimates: list[Estimate] = []
     rows: list[dict[str, Any]] = []
     for target in dataset.targets:
@@ -73,7 +121,7 @@ def perturb_dataset(
         "split": dataset.split,
         "method": START_METHOD,
         "settings": {"seed": seed, "evalkit": __version__},
-        "perturbation": {"rows": rows},
+        "perturbation": ({} if protocol is None else {"protocol": protocol}) | {"rows": rows},
     }
     write_results(out, estimates, sidecar)
     return len(estimates)

@@ -16,6 +16,8 @@ Array = np.ndarray
 SIDE_PX = 300
 TRUTH_RGB = (0, 224, 110)
 ESTIMATE_RGB = (255, 64, 160)
+DASH_PX, GAP_PX = 9, 6
+"""Colours alone are not told apart by everyone, so the estimate's contour is dashed."""
 MARGIN = 1.35
 LARGEST_OVER_TRUTH = 3.0
 """An estimate far away does not shrink the object to a dot: it may leave the picture instead."""
@@ -47,21 +49,35 @@ def overlay(
     T_gt: Float[Array, "4 4"],
     T_est: Float[Array, "4 4"] | None,
 ) -> UInt8[Array, "s s 3"]:
-    """The image in a window, with the true contour in green and the estimated one in pink over it."""
+    """The image in a window, with the true contour in green and over it the estimated one, dashed and pink."""
     shrinks = window.side_px > SIDE_PX
     patch = np.ascontiguousarray(cut(rgb, window, SIDE_PX, interpolation="area" if shrinks else "linear", fill=235))
     poses = [T_gt] if T_est is None else [T_gt, T_est]
     K = crop_K(camera.K, window, SIDE_PX)
     masks = evaluator.rasteriser.render(obj_id, K, np.stack(poses), SIDE_PX, SIDE_PX, rgb=False).mask
-    for mask, colour in zip(masks, (TRUTH_RGB, ESTIMATE_RGB), strict=False):
-        _draw_outline(patch, mask, colour)
+    true = _outlines(masks[0])
+    _draw(patch, true, True, TRUTH_RGB)
+    if T_est is not None:
+        dashes = [dash for outline in _outlines(masks[1]) for dash in _dashes(outline)]
+        _draw(patch, dashes, False, ESTIMATE_RGB)
     return patch
 
 
-def _draw_outline(patch: UInt8[Array, "s s 3"], mask: Bool[Array, "s s"], colour: tuple[int, int, int]) -> None:
-    outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    cv2.drawContours(patch, outlines, -1, (20, 20, 20), 4, cv2.LINE_AA)
-    cv2.drawContours(patch, outlines, -1, colour, 2, cv2.LINE_AA)
+def _outlines(mask: Bool[Array, "s s"]) -> Sequence[Array]:
+    return cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
+
+
+def _dashes(outline: Array) -> list[Array]:
+    """Pieces of a closed outline that holds every pixel, as many as fit with equal gaps."""
+    count = max(1, round(len(outline) / (DASH_PX + GAP_PX)))
+    starts = np.linspace(0, len(outline), count, endpoint=False).astype(int)
+    length = max(2, len(outline) * DASH_PX // (count * (DASH_PX + GAP_PX)))
+    return [outline[start : start + length] for start in starts]
+
+
+def _draw(patch: UInt8[Array, "s s 3"], lines: Sequence[Array], closed: bool, colour: tuple[int, int, int]) -> None:
+    cv2.polylines(patch, lines, closed, (20, 20, 20), 4, cv2.LINE_AA)
+    cv2.polylines(patch, lines, closed, colour, 2, cv2.LINE_AA)
 
 
 def read_image(evaluator: Evaluator, scene_id: int, im_id: int) -> UInt8[Array, "h w 3"] | None:

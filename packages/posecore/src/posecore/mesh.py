@@ -20,6 +20,7 @@ from scipy.spatial.distance import cdist
 
 from posecore.errors import MeshError
 from posecore.files import write_atomic
+from posecore.ply import refuse_broken_ply
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
 
@@ -135,6 +136,8 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
     if not data:
         raise MeshError(f"{file}: the file is empty (0 bytes), expected a mesh; export it again")
     geometry = _read(file)
+    if file.suffix.lower() == ".ply":
+        refuse_broken_ply(file, data)
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
@@ -174,7 +177,7 @@ def _read(file: Path) -> trimesh.Trimesh:
         # it would keep one of them, and the texture would smear along the seam.
         loaded = trimesh.load(file, process=False)
     except Exception as error:  # readers raise whatever they stumble over
-        reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
+        reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0][:200]
         raise MeshError(
             f"{file}: cannot be read as a mesh ({reason}); expected a valid .ply, .obj, .gltf, .glb or .stl file"
         ) from error
@@ -224,9 +227,16 @@ def _appearance(
 
 def _refuse_missing_texture(file: Path) -> None:
     """A material that names an image which is not there, or is none, is an error, never a silent grey."""
-    for texture in _textures(file):
-        if not texture.is_file():
-            raise MeshError(f"{file}: its texture {texture} is missing; put it beside the mesh")
+    try:
+        textures = _textures(file)
+        missing = [texture for texture in textures if not texture.is_file()]
+    except MeshError:
+        raise
+    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:  # a name that no file can have
+        raise MeshError(f"{file}: it names its texture in a way that cannot be read; export it again") from error
+    if missing:
+        raise MeshError(f"{file}: its texture {missing[0]} is missing; put it beside the mesh")
+    for texture in textures:
         if not cv2.haveImageReader(str(texture)):
             raise MeshError(f"{file}: its texture {texture} is not an image; export it again")
 

@@ -5,6 +5,7 @@ import logging
 import click
 
 from evalkit import __version__
+from evalkit.cli.diff import diff
 from evalkit.cli.group import CleanGroup
 from evalkit.cli.perturb import perturb
 from evalkit.cli.report import report
@@ -24,5 +25,6 @@ def main(verbose: bool) -> None:
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")
 
 
+main.add_command(diff)
 main.add_command(perturb)
 main.add_command(report)

@@ -3,17 +3,19 @@
 from pathlib import Path
 
 import click
-from posecore.bop import BopDataset
 
 from evalkit.cli.options import FOLDER, NEW_FILE, Numbers, split_option
-from evalkit.pairing import Level
-from evalkit.perturb import levels_of, perturb_dataset
 
 
 @click.command()
 @click.option("--dataset", type=FOLDER, required=True, help="BOP dataset folder with ground truth.")
 @click.option("--out", type=NEW_FILE, required=True, help="Result file to write; its sidecar goes beside it.")
 @split_option
+@click.option(
+    "--protocol",
+    type=click.Choice(["paper"]),
+    help="Levels of a published experiment. paper: rotated by 5, 10 ... 45 degrees, moved by 0, 0.1 ... 1 diameters.",
+)
 @click.option("--angles", type=Numbers(), default=(), help="Rotations, degrees: one start for each.")
 @click.option("--translations", type=Numbers(), default=(), help="Translations, object diameters: one start for each.")
 @click.option("--random-up-to", type=click.FloatRange(0, 180), help="One more start, rotated by 0 to this, degrees.")
@@ -27,6 +29,7 @@ def perturb(
     dataset: Path,
     out: Path,
     split: str | None,
+    protocol: str | None,
     angles: tuple[float, ...],
     translations: tuple[float, ...],
     random_up_to: float | None,
@@ -41,11 +44,29 @@ def perturb(
     Examples:
       evalkit perturb --dataset lmo --out start.csv --random-up-to 20 --random-translation 0.2
       evalkit perturb --dataset lmo --out curve.csv --angles 5,10,15,30,45 --translations 0.1,0.5,1
+      evalkit perturb --dataset lm --out curve.csv --protocol paper
     """
+    from posecore.bop import BopDataset
+    from posecore.errors import ConfigError
+
+    from evalkit.pairing import Level
+    from evalkit.perturb import PROTOCOLS, levels_of, perturb_dataset
+
+    if protocol is not None:
+        if angles or translations:
+            raise ConfigError(f"--protocol {protocol} brings its own levels; leave --angles and --translations away")
+        angles, translations = PROTOCOLS[protocol].angles_deg, PROTOCOLS[protocol].translations_diameter
     limit = None
     if random_up_to is not None or random_translation is not None:
         limit = Level(angle_deg=random_up_to or 0.0, translation_diameter=random_translation or 0.0)
     count = perturb_dataset(
-        BopDataset(dataset, split), out, levels=levels_of(angles, translations), seed=seed, random_up_to=limit
+        BopDataset(dataset, split),
+        out,
+        levels=levels_of(angles, translations),
+        seed=seed,
+        random_up_to=limit,
+        protocol=protocol,
     )
     click.echo(f"{count} start poses: {out}")
+    if protocol is not None:
+        click.echo(f"Protocol '{protocol}' refines them in {PROTOCOLS[protocol].iterations} iterations.")

@@ -2,7 +2,17 @@
 
 from posecore.bop.dataset import BopDataset, GroundTruth, Target
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
-from posecore.bop.results import Estimate, read_results, read_sidecar, sidecar_path, write_results
+from posecore.bop.results import (
+    Estimate,
+    ResultTable,
+    estimates_of,
+    read_result_table,
+    read_results,
+    read_sidecar,
+    sidecar_path,
+    table_of,
+    write_results,
+)
 from posecore.bop.writer import (
     BopWriter,
     FrameEntry,
@@ -22,13 +32,17 @@ __all__ = [
     "FrameFiles",
     "GroundTruth",
     "ModelInfo",
+    "ResultTable",
     "Target",
+    "estimates_of",
     "load_models_info",
+    "read_result_table",
     "read_results",
     "read_sidecar",
     "scene_folder",
     "sidecar_path",
     "symmetry_transforms",
+    "table_of",
     "visible_targets",
     "write_camera",
     "write_models",

@@ -1,81 +1,57 @@
 """A BOP dataset folder: cameras, images, ground truth, models and targets, in metres."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
-from posecore import se3
-from posecore.bop.images import COLOUR_FILES, DEPTH_FILES, find_image, image_size, read_image, read_rgb
-from posecore.bop.jsonfile import integer, integer_keys, numbers, read_json
-from posecore.bop.models_info import MM, ROTATION_TOLERANCE, ModelInfo, load_models_info
+from posecore.bop.annotations import GroundTruth, Target, camera_matrix, depth_scale, ground_truth, visib_fract
+from posecore.bop.images import image_size, read_depth, read_rgb
+from posecore.bop.jsonfile import integer, read_json
+from posecore.bop.models_info import MM, ModelInfo, load_models_info
+from posecore.bop.sources import Kind, MaskKind, some
+from posecore.bop.splits import choose_split, open_source
+from posecore.bop.stored import StoredFile
+from posecore.bop.webdataset import ShardSource
 from posecore.camera import Camera
-from posecore.errors import DatasetError
+from posecore.errors import CameraError, DatasetError
 from posecore.mesh import Mesh, load_mesh
 
+__all__ = ["BopDataset", "GroundTruth", "Target"]
+
 Array = np.ndarray
-PREFERRED_SPLITS = ("test", "val", "train_pbr", "train")
-NO_POSE_MM = -1.0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class GroundTruth:
-    """One annotated object of one image.
-
-    Attributes:
-        obj_id: object.
-        T_cam_obj: (4, 4) pose, metres, as in the file (real annotations are orthonormal to about 0.01 only); all NaN
-            where BOP says there is no pose.
-        visib_fract: visible share of the silhouette in [0, 1], or None where `scene_gt_info.json` is missing.
-        gt_index: position in the image's list, the number in mask file names.
-        has_pose: False where BOP marks the pose as unknown (t = -1, -1, -1).
-    """
-
-    obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
-    visib_fract: float | None = None
-    gt_index: int = 0
-    has_pose: bool = True
-
-
-@dataclass(frozen=True, kw_only=True, order=True)
-class Target:
-    """An object to be found in an image, `inst_count` times."""
-
-    scene_id: int
-    im_id: int
-    obj_id: int
-    inst_count: int = 1
 
 
 class BopDataset:
-    """One split of a BOP dataset. Files are read when asked for, JSON and meshes once."""
+    """One split of a BOP dataset. Files are read when asked for; annotations of the scenes used last are kept."""
 
-    def __init__(self, root: str | Path, split: str | None = None) -> None:
+    def __init__(self, root: str | Path, split: str | None = None, sensor: str | None = None) -> None:
         """Open a dataset folder.
 
         Args:
             root: folder with `models/` and split folders.
-            split: split folder's name; by default test, val, train_pbr, train or the only one, in this order.
+            split: split folder's name; by default test, val, train_pbr, train or the only one, in this order. A name
+                with a type (`test_primesense`) counts as the plain one where it is the only one of its kind. A split
+                is a folder of scene folders, or of webdataset shards (`*.tar`).
+            sensor: which camera of several (`cam1` for `scene_camera_cam1.json` and `rgb_cam1/`). Where scenes differ
+                (HOT3D: `rgb,gray1`), of names with commas between them the first that a scene has; scenes without are
+                left out. By default the camera without a name, else the only one.
 
         Raises:
-            DatasetError: no such folder, no split with scenes in it, or several and none preferred.
+            DatasetError: no such folder, no split with scenes in it, several and none preferred, no such sensor, or
+                several and none named.
         """
         self.root = Path(root)
         if not self.root.is_dir():
             raise DatasetError(f"{self.root}: no such folder; give the folder of a BOP dataset")
-        self.split = split or _choose_split(self.root)
+        self.split = split or choose_split(self.root)
         self.split_path = self.root / self.split
-        self.scene_ids: list[int] = sorted(int(scene.name) for scene in _scenes(self.split_path))
-        if not self.scene_ids:
-            raise DatasetError(f"{self.split_path}: no scene folder (000001, ...) with a scene_camera.json in it")
-        self._scene_paths = {int(scene.name): scene for scene in _scenes(self.split_path)}
-        self._json: dict[Path, Any] = {}
+        self._source, self.sensors = open_source(self.split_path, sensor)
+        self.scene_ids: list[int] = self._source.scene_ids
+        self._scenes = set(self.scene_ids)
         self._meshes: dict[Path, Mesh] = {}
 
     @property
@@ -83,24 +59,71 @@ class BopDataset:
         """The folder's name."""
         return self.root.resolve().name
 
+    @property
+    def is_sharded(self) -> bool:
+        """Whether the split lies in tar files."""
+        return isinstance(self._source, ShardSource)
+
     def scene_path(self, scene_id: int) -> Path:
-        """Folder of a scene.
+        """Folder of a scene; where scenes lie in tar files, the one it would be.
 
         Raises:
             DatasetError: there is no such scene.
         """
-        if scene_id not in self._scene_paths:
-            raise DatasetError(f"{self.split_path}: no scene {scene_id}; there are {_some(self.scene_ids)}")
-        return self._scene_paths[scene_id]
+        self._require(scene_id)
+        return self._source.scene_path(scene_id)
+
+    def _require(self, scene_id: int) -> None:
+        if scene_id not in self._scenes:
+            raise DatasetError(f"{self.split_path}: no scene {scene_id}; there are {some(self.scene_ids)}")
+
+    def files(self, scene_id: int) -> list[Path]:
+        """Files that hold a scene's annotations: its JSON files, or the shards it is in."""
+        self._require(scene_id)
+        return self._source.files(scene_id)
+
+    def forget(self, scene_id: int) -> None:
+        """Free what is kept in memory of a scene; it is read again when it is asked for."""
+        self._source.forget(scene_id)
 
     def im_ids(self, scene_id: int) -> list[int]:
-        """Annotated images of a scene; every image with a camera where the split has no ground truth."""
-        annotated = "scene_gt.json" if self.has_gt(scene_id) else "scene_camera.json"
-        return sorted(self._scene_json(scene_id, annotated))
+        """Annotated images of a scene; every image with a camera where the scene has no ground truth."""
+        return self._source.im_ids(scene_id, "gt" if self.has_gt(scene_id) else "camera")
+
+    def annotation(self, scene_id: int, kind: Kind) -> str:
+        """Where a scene's entries of a kind are or would be, for errors."""
+        self._require(scene_id)
+        return self._source.annotation(scene_id, kind)
+
+    def annotated_by(self, scene_id: int) -> str:
+        """What decides which images a scene has, in words for an error."""
+        if self.has_gt(scene_id):
+            return f"ground truth in {self._source.annotation(scene_id, 'gt')}"
+        return f"camera in {self._source.annotation(scene_id, 'camera')}"
 
     def has_gt(self, scene_id: int) -> bool:
         """Whether the scene comes with ground truth poses."""
-        return (self.scene_path(scene_id) / "scene_gt.json").is_file()
+        self._require(scene_id)
+        return self._source.has(scene_id, "gt")
+
+    def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str] | None:
+        """What the files say of an image as it stands there, and where; None where the scene has none of this kind.
+
+        Args:
+            scene_id: scene.
+            im_id: image.
+            kind: camera, gt or gt_info.
+
+        Raises:
+            DatasetError: the image has no entry, or its JSON is broken.
+        """
+        self._require(scene_id)
+        return self._source.entry(scene_id, im_id, kind) if self._source.has(scene_id, kind) else None
+
+    def annotated_im_ids(self, scene_id: int, kind: Kind) -> list[int]:
+        """Images that have an entry of this kind."""
+        self._require(scene_id)
+        return self._source.im_ids(scene_id, kind) if self._source.has(scene_id, kind) else []
 
     @cached_property
     def targets(self) -> list[Target]:
@@ -112,23 +135,53 @@ class BopDataset:
             DatasetError: the targets name a scene that is not there, or neither targets nor ground truth exist.
         """
         for edition in ("bop19", "bop24"):
-            file = self.root / f"{self.split}_targets_{edition}.json"
-            if file.is_file():
+            file = self.targets_file(edition)
+            if file is not None:
                 return sorted(self._listed_targets(file))
         images = [(scene_id, im_id) for scene_id in self.scene_ids for im_id in self.im_ids(scene_id)]
         return [target for image in images for target in self._annotated_targets(*image)]
 
-    def _listed_targets(self, file: Path) -> Iterator[Target]:
+    def targets_file(self, edition: str) -> Path | None:
+        """The split's targets of an edition (bop19, bop24), or None.
+
+        A split with a type (`test_primesense`) has its own or those of the plain split (`test`).
+        """
+        names = dict.fromkeys((self.split, self.split.split("_")[0]))
+        files = [self.root / f"{name}_targets_{edition}.json" for name in names]
+        return next((file for file in files if file.is_file()), None)
+
+    def target_images(self, edition: str = "bop24") -> list[tuple[int, int]]:
+        """Scene and image of every target of an edition, each once; all images where there is no such file.
+
+        Raises:
+            DatasetError: the targets name a scene that is not there.
+        """
+        file = self.targets_file(edition)
+        if file is None:
+            return [(scene_id, im_id) for scene_id in self.scene_ids for im_id in self.im_ids(scene_id)]
+        return sorted({(scene_id, im_id) for _, scene_id, im_id, _ in self._target_entries(file)})
+
+    def _target_entries(self, file: Path) -> Iterator[tuple[dict[str, Any], int, int, str]]:
         for index, entry in enumerate(read_json(file, list)):
             where = f"{file}, entry {index}"
             scene_id, im_id = integer(entry, "scene_id", where), integer(entry, "im_id", where)
-            if scene_id not in self._scene_paths:
+            if scene_id not in self._scenes:
                 raise DatasetError(f"{where}: scene {scene_id} is not in {self.split_path}; download or remove it")
+            yield entry, scene_id, im_id, where
+
+    def _listed_targets(self, file: Path) -> Iterator[Target]:
+        seen: dict[tuple[int, int, int], str] = {}
+        for entry, scene_id, im_id, where in self._target_entries(file):
             if "obj_id" not in entry:
                 yield from self._annotated_targets(scene_id, im_id)
                 continue
             count = integer(entry, "inst_count", where) if "inst_count" in entry else 1
-            yield Target(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
+            target = Target(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
+            key = (scene_id, im_id, target.obj_id)
+            if key in seen:  # its poses would be expected twice
+                raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one of them")
+            seen[key] = f"entry {where.rsplit(' ', 1)[-1]}"
+            yield target
 
     def _annotated_targets(self, scene_id: int, im_id: int) -> list[Target]:
         found = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
@@ -141,49 +194,113 @@ class BopDataset:
         """Intrinsics of one image; its size is that of the image file, else the one in `camera.json`.
 
         Raises:
-            DatasetError: the image has no camera, or its size is nowhere to be found.
+            DatasetError: the image has no camera, it is no pinhole, or its size is nowhere to be found.
         """
-        entry, where = self._entry(scene_id, im_id, "scene_camera.json")
-        width, height = self._size(scene_id, im_id)
-        return Camera(K=numbers(entry, "cam_K", 9, where).reshape(3, 3), width_px=width, height_px=height)
+        self._require(scene_id)
+        entry, where = self._source.entry(scene_id, im_id, "camera")
+        K = camera_matrix(entry, where)
+        width, height = self._size(scene_id, im_id, entry, where)
+        try:
+            return Camera(K=K, width_px=width, height_px=height)
+        except CameraError as error:
+            raise DatasetError(f"{where}: {error}") from error
 
-    def _size(self, scene_id: int, im_id: int) -> tuple[int, int]:
-        path = find_image(self.scene_path(scene_id), im_id, COLOUR_FILES + DEPTH_FILES)
-        if path is not None:
-            return image_size(path)
-        file = self.root / "camera.json"
-        entry = read_json(file) if file.is_file() else {}
-        if "width" not in entry or "height" not in entry:
-            raise DatasetError(f"{self.scene_path(scene_id)}: image {im_id} has no file, and {file} gives no size")
-        return integer(entry, "width", str(file)), integer(entry, "height", str(file))
+    def _size(self, scene_id: int, im_id: int, entry: Any, where: str) -> tuple[int, int]:
+        image = self._source.image(scene_id, im_id, "colour") or self._source.image(scene_id, im_id, "depth")
+        if image is not None:
+            return image_size(image)
+        model = entry.get("cam_model") if isinstance(entry, dict) else None
+        if isinstance(model, dict):
+            return integer(model, "image_width", where), integer(model, "image_height", where)
+        file = self.camera_file
+        about = read_json(file) if file is not None else {}
+        if "width" not in about or "height" not in about:
+            named = self.root / "camera.json" if file is None else file
+            raise DatasetError(f"{self.scene_path(scene_id)}: image {im_id} has no file, and {named} gives no size")
+        return integer(about, "width", str(file)), integer(about, "height", str(file))
 
-    def image_path(self, scene_id: int, im_id: int) -> Path:
+    @property
+    def camera_file(self) -> Path | None:
+        """The dataset's `camera.json`, that of the sensor or of the split's type where there is one; else None."""
+        kind = self.split.partition("_")[2]
+        names = [f"camera_{name}.json" for name in (*self.sensors, kind) if name] + ["camera.json"]
+        return next((self.root / name for name in names if (self.root / name).is_file()), None)
+
+    def image_file(self, scene_id: int, im_id: int) -> StoredFile:
         """The colour (else gray) image: png, jpg or tif.
 
         Raises:
             DatasetError: there is none.
         """
-        scene = self.scene_path(scene_id)
-        path = find_image(scene, im_id, COLOUR_FILES)
-        if path is None:
+        self._require(scene_id)
+        file = self._source.image(scene_id, im_id, "colour")
+        if file is None:
+            scene = self.scene_path(scene_id)
             raise DatasetError(f"{scene}: no image {im_id:06d} as png, jpg or tif in rgb/ or gray/")
-        return path
+        return file
+
+    def image_path(self, scene_id: int, im_id: int) -> Path:
+        """Where the colour (else gray) image lies; the tar file where it is in one.
+
+        Raises:
+            DatasetError: there is none.
+        """
+        return self.image_file(scene_id, im_id).path
 
     def rgb(self, scene_id: int, im_id: int) -> UInt8[Array, "h w 3"]:
         """The image in RGB; gray is repeated three times."""
-        return read_rgb(self.image_path(scene_id, im_id))
+        return read_rgb(self.image_file(scene_id, im_id))
+
+    def depth_file(self, scene_id: int, im_id: int) -> StoredFile | None:
+        """The depth image: png or tif; None where there is none."""
+        self._require(scene_id)
+        return self._source.image(scene_id, im_id, "depth")
 
     def depth_m(self, scene_id: int, im_id: int) -> Float[Array, "h w"] | None:
-        """Camera z in metres, 0 where unknown; None where the image has no depth file."""
-        path = find_image(self.scene_path(scene_id), im_id, DEPTH_FILES)
-        if path is None:
+        """Camera z in metres, 0 where unknown; None where the image has no depth file.
+
+        What is not finite or below 0 in a floating-point depth image counts as unknown.
+
+        Raises:
+            DatasetError: the file is damaged, its scale is not above 0, or its size is not that of the colour image.
+        """
+        file = self.depth_file(scene_id, im_id)
+        if file is None:
             return None
-        entry, where = self._entry(scene_id, im_id, "scene_camera.json")
-        scale = float(numbers(entry, "depth_scale", 1, where)[0]) if "depth_scale" in entry else 1.0
-        raw = read_image(path, cv2.IMREAD_UNCHANGED)
-        if raw.ndim != 2:
-            raise DatasetError(f"{path}: found {raw.ndim} axes, expected a depth image with one channel")
-        return np.asarray(raw, np.float32) * np.float32(scale * MM)
+        scale = self.depth_scale(scene_id, im_id)
+        raw = read_depth(file)
+        colour = self._source.image(scene_id, im_id, "colour")
+        size = (raw.shape[1], raw.shape[0])
+        if colour is not None and image_size(colour) != size:
+            width, height = image_size(colour)
+            raise DatasetError(f"{file}: is {size[0]} x {size[1]} pixels, expected {width} x {height} as {colour}")
+        depth_m = np.asarray(raw, np.float32) * np.float32(scale * MM)
+        return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+
+    def depth_scale(self, scene_id: int, im_id: int) -> float:
+        """Millimetres for one step of the image's depth; 1 where the files do not say.
+
+        Raises:
+            DatasetError: it is not above 0.
+        """
+        self._require(scene_id)
+        return depth_scale(*self._source.entry(scene_id, im_id, "camera"))
+
+    def mask(self, scene_id: int, im_id: int, gt_index: int, *, visible: bool = False) -> Bool[Array, "h w"] | None:
+        """Annotated silhouette of an object, whole or its visible part; None where the dataset has none.
+
+        Raises:
+            DatasetError: the mask is damaged.
+        """
+        found = self.mask_and_place(scene_id, im_id, gt_index, "mask_visib" if visible else "mask")
+        return None if found is None else found[0]
+
+    def mask_and_place(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[Array, "h w"], str] | None:
+        """As `mask`, with where it lies."""
+        self._require(scene_id)
+        return self._source.mask(scene_id, im_id, gt_index, kind)
 
     def gt(self, scene_id: int, im_id: int) -> list[GroundTruth]:
         """Annotated objects of an image, in the file's order.
@@ -196,29 +313,44 @@ class BopDataset:
                 f"{self.scene_path(scene_id)}: no scene_gt.json, so there is nothing to compare with; "
                 "use a split whose ground truth is public"
             )
-        entries, where = self._entry(scene_id, im_id, "scene_gt.json")
+        entries, where = self._source.entry(scene_id, im_id, "gt")
         if not isinstance(entries, list):
             raise DatasetError(f"{where}: found a {type(entries).__name__}, expected a list of objects")
         visibility = self._visibility(scene_id, im_id, len(entries))
         return [
-            _ground_truth(entry, index, visibility[index], f"{where}, entry {index}")
+            ground_truth(entry, index, visibility[index], f"{where}, entry {index}")
             for index, entry in enumerate(entries)
         ]
 
     def _visibility(self, scene_id: int, im_id: int, count: int) -> list[float | None]:
-        file = self.scene_path(scene_id) / "scene_gt_info.json"
-        if not file.is_file():
+        if not self._source.has(scene_id, "gt_info"):
             return [None] * count
-        entries, where = self._entry(scene_id, im_id, "scene_gt_info.json")
+        entries, where = self._source.entry(scene_id, im_id, "gt_info")
         if not isinstance(entries, list) or len(entries) != count:
-            raise DatasetError(f"{where}: does not list the {count} objects of scene_gt.json in the same order")
-        return [float(entry["visib_fract"]) if "visib_fract" in entry else None for entry in entries]
+            raise DatasetError(f"{where}: does not list the {count} objects of the ground truth in the same order")
+        return [visib_fract(entry, f"{where}, entry {index}") for index, entry in enumerate(entries)]
 
     @cached_property
     def models_info(self) -> dict[int, ModelInfo]:
-        """Diameters and symmetries, from `models/`, else `models_eval/`."""
-        choices = [self.root / folder / "models_info.json" for folder in ("models", "models_eval")]
-        return load_models_info(next((file for file in choices if file.is_file()), choices[0]))
+        """Diameters and symmetries, from `models/`, else another models folder."""
+        return load_models_info(self.models_info_file)
+
+    @property
+    def models_info_file(self) -> Path:
+        """The file that `models_info` reads; it may be missing."""
+        choices = [folder / "models_info.json" for folder in self.models_folders()]
+        return next((file for file in choices if file.is_file()), self.root / "models" / "models_info.json")
+
+    def models_folders(self, eval: bool = False) -> list[Path]:
+        """Folders with models that exist, the preferred one first.
+
+        They are `models`, then those of a type (`models_cad`) by name, then those for evaluation (`models_eval`);
+        with `eval` these come first.
+        """
+        found = sorted(path for path in self.root.glob("models*") if path.is_dir() and _is_models(path.name))
+        plain = [path for path in found if not path.name.endswith("_eval")]
+        simplified = [path for path in found if path.name.endswith("_eval")]
+        return simplified + plain if eval else plain + simplified
 
     @property
     def obj_ids(self) -> list[int]:
@@ -231,12 +363,11 @@ class BopDataset:
         Raises:
             DatasetError: there is no such model.
         """
-        folders = ("models_eval", "models") if eval else ("models", "models_eval")
-        for folder in folders:
-            path = self.root / folder / f"obj_{obj_id:06d}.ply"
+        for folder in self.models_folders(eval):
+            path = folder / f"obj_{obj_id:06d}.ply"
             if path.is_file():
                 return path
-        raise DatasetError(f"{self.root / 'models'}: no obj_{obj_id:06d}.ply; known objects are {_some(self.obj_ids)}")
+        raise DatasetError(f"{self.root / 'models'}: no obj_{obj_id:06d}.ply; known objects are {some(self.obj_ids)}")
 
     def mesh(self, obj_id: int, eval: bool = False) -> Mesh:
         """A model in metres; with `eval` the simplified one that BOP scores with, where there is one."""
@@ -245,49 +376,6 @@ class BopDataset:
             self._meshes[path] = load_mesh(path, units="mm")
         return self._meshes[path]
 
-    def _scene_json(self, scene_id: int, name: str) -> dict[int, Any]:
-        file = self.scene_path(scene_id) / name
-        if file not in self._json:
-            self._json[file] = integer_keys(read_json(file), file)
-        content: dict[int, Any] = self._json[file]
-        return content
 
-    def _entry(self, scene_id: int, im_id: int, name: str) -> tuple[Any, str]:
-        content = self._scene_json(scene_id, name)
-        file = self.scene_path(scene_id) / name
-        if im_id not in content:
-            raise DatasetError(f"{file}: no entry for image {im_id}; there are {_some(sorted(content))}")
-        return content[im_id], f"{file}, image {im_id}"
-
-
-def _ground_truth(entry: Any, index: int, visib_fract: float | None, where: str) -> GroundTruth:
-    obj_id = integer(entry, "obj_id", where)
-    t_mm = numbers(entry, "cam_t_m2c", 3, where)
-    if np.all(t_mm == NO_POSE_MM):
-        nowhere = np.full((4, 4), np.nan)
-        return GroundTruth(obj_id=obj_id, T_cam_obj=nowhere, visib_fract=visib_fract, gt_index=index, has_pose=False)
-    R = numbers(entry, "cam_R_m2c", 9, where).reshape(3, 3)
-    if not bool(se3.is_rotation(R, ROTATION_TOLERANCE)):
-        raise DatasetError(f"{where}: 'cam_R_m2c' is not a rotation (9 numbers by rows, determinant +1)")
-    return GroundTruth(obj_id=obj_id, T_cam_obj=se3.make_T(R, t_mm * MM), visib_fract=visib_fract, gt_index=index)
-
-
-def _scenes(split_path: Path) -> list[Path]:
-    if not split_path.is_dir():
-        return []
-    return [path for path in split_path.iterdir() if path.name.isdigit() and (path / "scene_camera.json").is_file()]
-
-
-def _choose_split(root: Path) -> str:
-    splits = sorted(path.name for path in root.iterdir() if path.is_dir() and _scenes(path))
-    preferred = [name for name in PREFERRED_SPLITS if name in splits]
-    if preferred or len(splits) == 1:
-        return (preferred or splits)[0]
-    if not splits:
-        hint = "; this is a split folder, give the one above" if _scenes(root) else ""
-        raise DatasetError(f"{root}: no split with scenes (test/000001/scene_camera.json, ...) in it{hint}")
-    raise DatasetError(f"{root}: several splits ({', '.join(splits)}); say which one with --split")
-
-
-def _some(ids: list[int], limit: int = 8) -> str:
-    return ", ".join(map(str, ids[:limit])) + (f", ... ({len(ids)} in all)" if len(ids) > limit else "")
+def _is_models(name: str) -> bool:
+    return name == "models" or name.startswith("models_")

@@ -1,78 +1,150 @@
-"""Image files of a BOP folder: which one there is, its size, its pixels."""
+"""Image files of a BOP dataset: which one there is, its size, its pixels."""
 
 import struct
+import zlib
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Shaped, UInt8
+from jaxtyping import Bool, Shaped, UInt8
 
+from posecore.bop.stored import StoredFile, stored
 from posecore.errors import DatasetError, StorageError
 from posecore.files import write_atomic
 
 Array = np.ndarray
-COLOUR_FILES = tuple((folder, ext) for folder in ("rgb", "gray") for ext in ("png", "jpg", "jpeg", "tif", "tiff"))
-DEPTH_FILES = tuple(("depth", ext) for ext in ("png", "tif", "tiff"))
-_ENDINGS = ((b"\x89PNG", b"IEND"), (b"\xff\xd8", b"\xff\xd9"))  # how a whole file starts and ends
+COLOUR_EXTENSIONS = ("png", "jpg", "jpeg", "tif", "tiff")
+DEPTH_EXTENSIONS = ("png", "tif", "tiff")
+LARGEST_IMAGE_PX = 1 << 28
+_PNG = b"\x89PNG\r\n\x1a\n"
+_HEAD_BYTES = 1 << 16
 
 
-def find_image(scene: Path, im_id: int, choices: tuple[tuple[str, str], ...]) -> Path | None:
-    """The first existing file among (folder, extension) `choices`, or None."""
-    for folder, extension in choices:
-        path = scene / folder / f"{im_id:06d}.{extension}"
-        if path.is_file():
-            return path
+def find_image(folders: tuple[Path, ...], name: str, extensions: tuple[str, ...]) -> Path | None:
+    """The first existing file of this name in the folders, in the order of the extensions, or None."""
+    for folder in folders:
+        for extension in extensions:
+            path = folder / f"{name}.{extension}"
+            if path.is_file():
+                return path
     return None
 
 
-def read_image(path: Path, flags: int) -> Shaped[Array, "h w *c"]:
-    """Decode an image file with OpenCV's flags; colours stay in OpenCV's order.
+def read_image(file: Path | StoredFile, flags: int) -> Shaped[Array, "h w *c"]:
+    """Decode an image file with OpenCV's flags, as it is stored (an EXIF turn is ignored); colours in OpenCV's order.
 
     Raises:
-        DatasetError: the file is missing, cut off or not an image.
+        DatasetError: the file is missing, cut off, damaged, absurdly large or not an image.
     """
+    source = stored(file)
     try:
-        data = path.read_bytes()
-    except OSError:
+        data = source.read()
+    except DatasetError:
         data = b""
-    # OpenCV fills the rest of a JPEG that is cut off with grey, and lets libpng complain on stderr about a PNG.
-    ending = next((end for start, end in _ENDINGS if data.startswith(start)), b"")
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data and ending in data[-4096:] else None
+    size = _stated_size(data)
+    if size is not None and not 0 < size[0] * size[1] <= LARGEST_IMAGE_PX:
+        raise DatasetError(f"{source}: says it is {size[0]} x {size[1]} pixels; the file is damaged, copy it again")
+    image = None
+    if data and _is_whole(data):
+        try:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        except (cv2.error, MemoryError):
+            image = None
     if image is None:
-        raise DatasetError(f"{path}: cannot be decoded as an image; the file is missing or cut off, copy it again")
-    return image
+        raise DatasetError(f"{source}: cannot be decoded as an image; the file is missing or cut off, copy it again")
+    return np.asarray(image)
 
 
-def read_rgb(path: Path) -> UInt8[Array, "h w 3"]:
-    """Read a colour or gray image as 8-bit RGB; 16-bit images are scaled down."""
-    image = read_image(path, cv2.IMREAD_COLOR)
+def _is_whole(data: bytes) -> bool:
+    """Whether a PNG or JPEG ends as it should.
+
+    OpenCV fills the rest of a JPEG that is cut off with grey, and lets libpng complain on stderr about a PNG. A PNG
+    carries checksums, which some of its readers do not look at.
+    """
+    if data.startswith(_PNG):
+        return _whole_png(data)
+    if data.startswith(b"\xff\xd8"):
+        return b"\xff\xd9" in data[-4096:]
+    return True
+
+
+def _whole_png(data: bytes) -> bool:
+    position = len(_PNG)
+    while position + 12 <= len(data):
+        (length,) = struct.unpack(">I", data[position : position + 4])
+        end = position + 8 + length
+        if end + 4 > len(data):
+            return False
+        body = memoryview(data)[position + 4 : end]
+        if zlib.crc32(body) != struct.unpack(">I", data[end : end + 4])[0]:
+            return False
+        if bytes(body[:4]) == b"IEND":
+            return True
+        position = end + 4
+    return False
+
+
+def read_rgb(file: Path | StoredFile) -> UInt8[Array, "h w 3"]:
+    """Read a colour or gray image as 8-bit RGB; 16-bit images are scaled down.
+
+    Raises:
+        DatasetError: the file is not a whole image of 8 or 16 bits.
+    """
+    image = read_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.dtype != np.uint8:
+        raise DatasetError(f"{file}: holds {image.dtype} pixels, expected a colour or gray image of 8 or 16 bits")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def image_size(path: Path) -> tuple[int, int]:
+def read_depth(file: Path | StoredFile) -> Shaped[Array, "h w"]:
+    """Read a depth image's stored numbers.
+
+    Raises:
+        DatasetError: the file is not a whole image with one channel.
+    """
+    raw = read_image(file, cv2.IMREAD_UNCHANGED)
+    if raw.ndim != 2:
+        raise DatasetError(f"{file}: found {raw.ndim} axes, expected a depth image with one channel")
+    return raw
+
+
+def read_mask(file: Path | StoredFile) -> Bool[Array, "h w"]:
+    """Read a mask image: true where it is not 0.
+
+    Raises:
+        DatasetError: the file is not a whole image.
+    """
+    return np.asarray(read_image(file, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) > 0)
+
+
+def image_size(file: Path | StoredFile) -> tuple[int, int]:
     """Width and height in pixels, from the header of a PNG or JPEG, else by decoding.
 
     Raises:
-        DatasetError: the file cannot be decoded.
+        DatasetError: the file cannot be read or decoded.
     """
-    data = path.read_bytes()
-    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
+    source = stored(file)
+    size = _stated_size(source.read(_HEAD_BYTES))
+    if size is None or not 0 < size[0] * size[1] <= LARGEST_IMAGE_PX:
+        height, width = read_image(source, cv2.IMREAD_UNCHANGED).shape[:2]
         return int(width), int(height)
-    size = _jpeg_size(data) if data[:2] == b"\xff\xd8" else None
-    if size is not None:
-        return size
-    height, width = read_image(path, cv2.IMREAD_UNCHANGED).shape[:2]
-    return width, height
+    return size
+
+
+def _stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height as the start of a PNG or JPEG states them; None where it does not."""
+    if data.startswith(_PNG) and len(data) >= 33:
+        width, height = struct.unpack(">II", data[16:24])
+        is_intact = zlib.crc32(data[12:29]) == struct.unpack(">I", data[29:33])[0]
+        return (int(width), int(height)) if is_intact else None
+    return _jpeg_size(data) if data.startswith(b"\xff\xd8") else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header; None if there is none, or an EXIF orientation may turn the image."""
+    """Walk the segments up to the frame header; None if there is none."""
     position = 2
     while position + 9 < len(data) and data[position] == 0xFF:
         marker, length = data[position + 1], struct.unpack(">H", data[position + 2 : position + 4])[0]
-        if marker == 0xE1:
-            return None
         if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return int(width), int(height)

@@ -1,6 +1,8 @@
 """JSON of a BOP folder: read with the place of every error, written atomically."""
 
 import json
+import math
+import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from posecore.errors import DatasetError
 from posecore.files import write_atomic
 
 Array = np.ndarray
+LARGEST_INTEGER = 2**63 - 1
 
 
 def read_json(path: str | Path, kind: type = dict) -> Any:
@@ -22,17 +25,50 @@ def read_json(path: str | Path, kind: type = dict) -> Any:
     """
     file = Path(path)
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot be read ({error.strerror}); a BOP folder needs this file") from error
+        data = file.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise DatasetError(f"{file}: cannot be read ({reason}); a BOP folder needs this file") from error
+    return parse_json(data, str(file), kind)
+
+
+def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
+    """Read JSON whose top level is a `kind` (dict or list).
+
+    Args:
+        data: the file's bytes.
+        name: what errors call it.
+        kind: of the top level.
+
+    Raises:
+        DatasetError: not UTF-8, invalid JSON (with line and column), a key that stands twice in one object, nested too
+            deep, a number with thousands of digits, another top level.
+    """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        content = dict(pairs)
+        if len(content) < len(pairs):  # the parser would keep the last one in silence
+            keys = [key for key, _ in pairs]
+            twice = next(key for key in keys if keys.count(key) > 1)
+            raise DatasetError(f"{name}: the key {shown(twice)} stands twice in one object; remove one of them")
+        return content
+
+    try:
+        content = json.loads(data.decode("utf-8-sig"), object_pairs_hook=unique)
     except UnicodeDecodeError as error:
-        raise DatasetError(f"{file}: not UTF-8 text (byte {error.start}), expected JSON") from error
+        raise DatasetError(f"{name}: not UTF-8 text (byte {error.start}), expected JSON") from error
     except json.JSONDecodeError as error:
         raise DatasetError(
-            f"{file}:{error.lineno}:{error.colno}: invalid JSON ({error.msg}); the file is cut off or was edited"
+            f"{name}:{error.lineno}:{error.colno}: invalid JSON ({error.msg}); the file is cut off or was edited"
         ) from error
+    except RecursionError as error:
+        raise DatasetError(f"{name}: brackets are nested too deep, expected the JSON of a BOP dataset") from error
+    except DatasetError:
+        raise
+    except ValueError as error:  # the interpreter's limit on the digits of a whole number
+        raise DatasetError(f"{name}: a number has thousands of digits, expected the JSON of a BOP dataset") from error
     if not isinstance(content, kind):
-        raise DatasetError(f"{file}: found a {type(content).__name__} at the top, expected a {kind.__name__}")
+        raise DatasetError(f"{name}: found a {type(content).__name__} at the top, expected a {kind.__name__}")
     return content
 
 
@@ -41,45 +77,82 @@ def write_json(path: str | Path, content: Any) -> None:
     write_atomic(path, (json.dumps(content, indent=2) + "\n").encode())
 
 
+def shown(value: Any) -> str:
+    """A value in an error: one line, and short however large it is."""
+    short = reprlib.Repr()
+    short.maxlist = short.maxdict = 9
+    short.maxstring = short.maxother = 60
+    try:
+        text = short.repr(value)
+    except ValueError:  # a whole number with more digits than the interpreter writes
+        return f"a {type(value).__name__}"
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
 def numbers(entry: Any, key: str, count: int, where: str) -> Float[Array, " n"]:
-    """The `count` finite numbers under `entry[key]`.
+    """The `count` finite numbers under `entry[key]`: one number, a list, or a list of rows.
 
     Raises:
         DatasetError: the key is missing, or it holds something else; the message starts with `where`.
     """
     if not isinstance(entry, dict) or key not in entry:
         raise DatasetError(f"{where}: has no '{key}', expected {count} numbers")
+    found = entry[key]
+    rows = found if isinstance(found, list) else [found]
+    values = [value for row in rows for value in (row if isinstance(row, list) else [row])]
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
+        raise DatasetError(f"{where}: '{key}' is {shown(found)}, expected {count} numbers")
+    if len(values) != count:
+        raise DatasetError(
+            f"{where}: '{key}' has {len(values)} numbers, {shown(found)}, expected {count} finite numbers"
+        )
     try:
-        values = np.asarray(entry[key], dtype=np.float64).reshape(-1)
-    except (TypeError, ValueError) as error:
-        raise DatasetError(f"{where}: '{key}' is {str(entry[key])[:60]}, expected {count} numbers") from error
-    if len(values) != count or not np.isfinite(values).all():
-        raise DatasetError(f"{where}: '{key}' holds {str(entry[key])[:60]}, expected {count} finite numbers")
-    return values
+        array = np.array([float(value) for value in values], np.float64)
+    except OverflowError as error:
+        raise DatasetError(f"{where}: '{key}' holds {shown(found)}, expected {count} finite numbers") from error
+    if not np.isfinite(array).all():
+        raise DatasetError(f"{where}: '{key}' holds {shown(found)}, expected {count} finite numbers")
+    return array
 
 
 def integer(entry: Any, key: str, where: str) -> int:
-    """The integer under `entry[key]`.
+    """The whole number from 0 under `entry[key]`.
 
     Raises:
         DatasetError: the key is missing, or it holds something else; the message starts with `where`.
     """
     value = entry.get(key) if isinstance(entry, dict) else None
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise DatasetError(f"{where}: '{key}' is {value!r}, expected an integer")
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= LARGEST_INTEGER:
+        raise DatasetError(f"{where}: '{key}' is {shown(value)}, expected an integer, 0 or more")
     return value
 
 
-def integer_keys(content: dict[str, Any], file: Path) -> dict[int, Any]:
+def fraction(entry: Any, key: str, where: str) -> float:
+    """The number from 0 to 1 under `entry[key]`; rounding may have moved it out by 1e-6.
+
+    Raises:
+        DatasetError: the key is missing, or it holds something else; the message starts with `where`.
+    """
+    value = float(numbers(entry, key, 1, where)[0])
+    if not -1e-6 <= value <= 1 + 1e-6 or not math.isfinite(value):
+        raise DatasetError(f"{where}: '{key}' is {value:g}, expected 0 to 1")
+    return min(max(value, 0.0), 1.0)
+
+
+def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """The same mapping with its keys as integers.
 
     Raises:
-        DatasetError: a key is not an integer.
+        DatasetError: a key is not a whole number from 0, or two of them are the same one (`7` and `007`).
     """
-    try:
-        return {int(key): value for key, value in content.items()}
-    except ValueError as error:
-        raise DatasetError(f"{file}: a key is not an integer ({error}), expected image or object ids") from error
+    found: dict[int, Any] = {}
+    for key, value in content.items():
+        if not (key.isascii() and key.isdigit()) or len(key) > 18:
+            raise DatasetError(f"{file}: a key is not an integer ({shown(key)}), expected image or object ids")
+        if int(key) in found:
+            raise DatasetError(f"{file}: two keys mean {int(key)}, one of them {shown(key)}; remove one")
+        found[int(key)] = value
+    return found
 
 
 def as_list(values: Sequence[float] | Float[Array, "..."]) -> list[float]:

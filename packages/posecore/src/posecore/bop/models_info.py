@@ -8,15 +8,24 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore import se3
-from posecore.bop.jsonfile import as_list, integer_keys, numbers, read_json, write_json
+from posecore.bop.jsonfile import as_list, integer_keys, numbers, read_json, shown, write_json
 from posecore.errors import DatasetError
 from posecore.mesh import Mesh
 from posecore.symmetry import ContinuousSymmetry, symmetry_transforms
 
-__all__ = ["ContinuousSymmetry", "ModelInfo", "load_models_info", "save_models_info", "symmetry_transforms"]
+__all__ = [
+    "ContinuousSymmetry",
+    "ModelInfo",
+    "load_model_info",
+    "load_models_info",
+    "save_models_info",
+    "symmetry_transforms",
+]
 
 Array = np.ndarray
 MM = 1e-3
+LARGEST_MM = 1e6
+"""No length in `models_info.json` is larger: a kilometre."""
 ROTATION_TOLERANCE = 2e-2
 """Largest entry of R R^T - I that passes: LM-O's own annotations reach 0.0096 (a scale of 1.0048)."""
 
@@ -52,23 +61,38 @@ def load_models_info(path: str | Path) -> dict[int, ModelInfo]:
     entries = integer_keys(read_json(file), file)
     if not entries:
         raise DatasetError(f"{file}: no objects, expected one entry for each model")
-    return {obj_id: _model_info(entry, f"{file}, object {obj_id}") for obj_id, entry in sorted(entries.items())}
+    return {obj_id: load_model_info(entry, f"{file}, object {obj_id}") for obj_id, entry in sorted(entries.items())}
 
 
-def _model_info(entry: Any, where: str) -> ModelInfo:
+def load_model_info(entry: Any, where: str) -> ModelInfo:
+    """Read one object's entry of `models_info.json`, in metres.
+
+    Raises:
+        DatasetError: as `load_models_info`; the message starts with `where`.
+    """
     diameter_mm = float(numbers(entry, "diameter", 1, where)[0])
-    if diameter_mm <= 0:
+    if not 0 < diameter_mm <= LARGEST_MM:
         raise DatasetError(f"{where}: the diameter is {diameter_mm}, expected a positive number of millimetres")
     return ModelInfo(
         diameter_m=diameter_mm * MM,
-        symmetries_discrete=tuple(_discrete(item, where) for item in entry.get("symmetries_discrete", ())),
-        symmetries_continuous=tuple(_continuous(item, where) for item in entry.get("symmetries_continuous", ())),
+        symmetries_discrete=tuple(_discrete(item, where) for item in _listed(entry, "symmetries_discrete", where)),
+        symmetries_continuous=tuple(
+            _continuous(item, where) for item in _listed(entry, "symmetries_continuous", where)
+        ),
     )
+
+
+def _listed(entry: dict[str, Any], key: str, where: str) -> list[Any]:
+    items = entry.get(key, [])
+    if not isinstance(items, list):
+        raise DatasetError(f"{where}: '{key}' is {shown(items)}, expected a list")
+    return items
 
 
 def _discrete(item: Any, where: str) -> Float[Array, "4 4"]:
     T = numbers({"symmetries_discrete": item}, "symmetries_discrete", 16, where).reshape(4, 4).copy()
-    if not bool(se3.is_rotation(T[:3, :3], ROTATION_TOLERANCE)) or not np.allclose(T[3], [0, 0, 0, 1]):
+    is_rigid = np.abs(T).max() <= LARGEST_MM and bool(se3.is_rotation(T[:3, :3], ROTATION_TOLERANCE))
+    if not is_rigid or not np.allclose(T[3], [0, 0, 0, 1]):
         raise DatasetError(f"{where}: a discrete symmetry is not a rotation and a translation (16 numbers by rows)")
     T[:3, 3] *= MM
     return T
@@ -76,7 +100,9 @@ def _discrete(item: Any, where: str) -> Float[Array, "4 4"]:
 
 def _continuous(item: Any, where: str) -> ContinuousSymmetry:
     axis, offset_mm = numbers(item, "axis", 3, where), numbers(item, "offset", 3, where)
-    length = float(np.linalg.norm(axis))
+    if np.abs(offset_mm).max() > LARGEST_MM:
+        raise DatasetError(f"{where}: the offset of a continuous symmetry is {offset_mm.tolist()} mm, expected a point")
+    length = float(np.linalg.norm(axis)) if np.abs(axis).max() <= LARGEST_MM else 0.0
     if length < 1e-6:
         raise DatasetError(f"{where}: the axis of a continuous symmetry is {axis.tolist()}, expected a direction")
     x, y, z = as_list(axis / length)

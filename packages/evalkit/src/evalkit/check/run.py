@@ -1,0 +1,79 @@
+"""All checks in order: models, annotations, pixels, targets, ground truth against itself, result files."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from posecore.bop import BopDataset
+from posecore.errors import PoseError
+
+from evalkit.check.findings import Findings
+from evalkit.check.models import check_models
+from evalkit.check.pixels import check_pixels
+from evalkit.check.results import check_results
+from evalkit.check.scenes import check_scenes
+from evalkit.check.targets import check_targets
+from evalkit.check.truth import check_truth
+
+SAMPLES = 100
+
+
+def check(
+    dataset: str | Path,
+    results: Sequence[str | Path] = (),
+    *,
+    split: str | None = None,
+    sensor: str | None = None,
+    samples: int = SAMPLES,
+    limit: int | None = 10,
+    stage: Callable[[str], None] = lambda name: None,
+) -> Findings:
+    """Check a dataset and result files.
+
+    Annotations, models and result lines are all read. Images are looked for, and `samples` of them, spread evenly,
+    decoded and their true poses evaluated against themselves.
+
+    Args:
+        dataset: BOP dataset folder.
+        results: result files.
+        split: as `BopDataset` takes it.
+        sensor: as `BopDataset` takes it.
+        samples: images to decode.
+        limit: violations of a kind to keep, None for all; every one is counted.
+        stage: is told what is checked next.
+
+    Returns:
+        What was found; nothing a user's files can hold raises.
+    """
+    findings = Findings(limit)
+    opened: BopDataset | None = None
+    try:
+        opened = BopDataset(dataset, split, sensor)
+    except PoseError as error:
+        findings.add_error("dataset", error)
+    if opened is not None:
+        _check_dataset(opened, samples, findings, stage)
+    for path in results:
+        stage(str(path))
+        check_results(Path(path), opened if opened is not None and _has_models(opened) else None, findings)
+    return findings
+
+
+def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, stage: Callable[[str], None]) -> None:
+    stage("models")
+    infos = check_models(dataset, findings)
+    stage("annotations")
+    scenes = check_scenes(dataset, infos, findings)
+    stage("images")
+    chosen = check_pixels(dataset, scenes, infos, samples, findings)
+    stage("targets")
+    check_targets(dataset, scenes, set(infos), findings)
+    if findings.ok:  # else the evaluation would refuse the same faults again
+        stage("ground truth against itself")
+        check_truth(dataset, scenes, chosen, findings)
+
+
+def _has_models(dataset: BopDataset) -> bool:
+    try:
+        return bool(dataset.models_info)
+    except PoseError:  # reported with the models
+        return False

@@ -1,0 +1,76 @@
+"""What two result files are compared by: one value for each expected pose, with its unit and which way is better."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from evalkit.scores.definitions import AUC_LIMIT_M
+from evalkit.scores.values import add_s_m, area_under_recall, average_recalls, found_errors, solved
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measure:
+    """A measure.
+
+    Attributes:
+        unit: of its values, empty for shares.
+        better: which way is better.
+        text: what it is.
+        of: a table and the limit of failure in diameters to one value a row. Shares and VSS are 0 where an estimate is
+            missing, errors are NaN: those are compared over the poses found in both files.
+        yes_or_no: whether each value is 0 or 1, whose median says nothing.
+    """
+
+    unit: Literal["", "mm", "px", "deg"]
+    better: Literal["higher", "lower"]
+    text: str
+    of: Callable[[pd.DataFrame, float], Float[Array, " n"]]
+    yes_or_no: bool = False
+
+    @property
+    def digits(self) -> int:
+        """Decimals to show."""
+        return 2 if self.unit else 4
+
+
+def _share(text: str, of: Callable[[pd.DataFrame, float], Array]) -> Measure:
+    return Measure(unit="", better="higher", text=text, of=of)
+
+
+def _error(unit: Literal["mm", "px", "deg"], key: str, text: str) -> Measure:
+    return Measure(unit=unit, better="lower", text=text, of=lambda table, _: found_errors(table)[key])
+
+
+MEASURES: Mapping[str, Measure] = {
+    "vss": _share("visual surface similarity", lambda table, _: table.vss.to_numpy(np.float64)),
+    "recall": Measure(
+        unit="",
+        better="higher",
+        text="ADD(-S) under the limit",
+        of=lambda table, limit: solved(table, limit).astype(np.float64),
+        yes_or_no=True,
+    ),
+    "auc": _share("area of ADD(-S) recall to 100 mm", lambda table, _: area_under_recall(add_s_m(table), AUC_LIMIT_M)),
+    "ar_mssd": _share("BOP average recall of MSSD", lambda table, _: average_recalls(table)["ar_mssd"]),
+    "ar_mspd": _share("BOP average recall of MSPD", lambda table, _: average_recalls(table)["ar_mspd"]),
+    "add": _error("mm", "add_mm", "ADD"),
+    "adi": _error("mm", "adi_mm", "ADI (ADD-S)"),
+    "add_s": Measure(
+        unit="mm", better="lower", text="ADD(-S): ADI of symmetric objects", of=lambda table, _: add_s_m(table) * 1e3
+    ),
+    "mssd": _error("mm", "mssd_mm", "maximum surface distance"),
+    "mspd": _error("px", "mspd_px", "maximum projected distance"),
+    "proj": _error("px", "proj_px", "average projected distance"),
+    "re": _error("deg", "re_deg", "rotation error"),
+    "re_sym": _error("deg", "re_sym_deg", "rotation error at the best symmetry"),
+    "te": _error("mm", "te_mm", "distance of the origins"),
+    "tx": _error("mm", "tx_mm", "error along camera x"),
+    "ty": _error("mm", "ty_mm", "error along camera y"),
+    "tz": _error("mm", "tz_mm", "error along camera z"),
+}

@@ -1,0 +1,206 @@
+"""The two files that are compared: BOP result files, or tables of errors that `evalkit report` wrote."""
+
+import csv
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from posecore.bop import BopDataset
+from posecore.errors import ConfigError, ResultFileError
+from posecore.files import sha256_file
+
+from evalkit.evaluate import Evaluator, VssKind
+from evalkit.files import dataset_of, load_result_files
+from evalkit.pairing import pair_up
+from evalkit.scored import Scored
+from evalkit.table import COLUMNS
+
+NO_POSE = np.full((4, 4), np.nan)
+NAMES_COLUMN = "results"
+"""Of a table of errors: which result file a line is of."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Side:
+    """One of the two.
+
+    Attributes:
+        name: what tables call it.
+        path: where it lies.
+        sha256: of its bytes.
+        table: its errors, see `evalkit.table`.
+        scored: the same with its poses; None where only a table of errors was given.
+    """
+
+    name: str
+    path: Path
+    sha256: str
+    table: pd.DataFrame
+    scored: Scored | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sides:
+    """Both, the first the one that the second is compared with, and the evaluator, where poses were evaluated."""
+
+    a: Side
+    b: Side
+    evaluator: Evaluator | None
+
+
+@contextmanager
+def open_sides(
+    paths: tuple[Path, Path],
+    *,
+    results: tuple[str | None, str | None] = (None, None),
+    dataset: Path | None = None,
+    split: str | None = None,
+    vss: VssKind = "full",
+) -> Iterator[Sides]:
+    """Read two files, and evaluate those that are result files.
+
+    Args:
+        paths: each a BOP result file or an `estimates.csv` of a report.
+        results: which result file of a table of errors is meant, where it holds several.
+        dataset: folder; by default the one that the result files' sidecars name. Tables of errors need none.
+        split: of the dataset.
+        vss: whole silhouettes or visible parts.
+
+    Raises:
+        PoseError: a file or the dataset is not usable; the message names it.
+    """
+    tables = [
+        read_errors(path, name) if is_table_of_errors(path) else None for path, name in zip(paths, results, strict=True)
+    ]
+    to_score = list(dict.fromkeys(path for path, side in zip(paths, tables, strict=True) if side is None))
+    if not to_score:
+        a, b = _renamed([side for side in tables if side is not None])
+        yield Sides(a=a, b=b, evaluator=None)
+        return
+    for path, name, side in zip(paths, results, tables, strict=True):
+        if side is None and name is not None:
+            raise ConfigError(f"{path}: is a result file, which holds no '{name}'; leave --result-a and --result-b out")
+    opened = BopDataset(dataset or dataset_of(to_score, Path()), split)
+    with Evaluator(opened, vss) as evaluator:
+        scored = {item.file.path: item for item in _scored(evaluator, to_score)}
+        both = [side or _side_of(scored[path]) for path, side in zip(paths, tables, strict=True)]
+        a, b = _renamed(both)
+        yield Sides(a=a, b=b, evaluator=evaluator)
+
+
+def _scored(evaluator: Evaluator, paths: Sequence[Path]) -> Iterator[Scored]:
+    for file in load_result_files(paths, evaluator.dataset):
+        pairing = pair_up(evaluator.dataset, file)
+        estimated = [NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]
+        yield Scored(
+            file=file,
+            table=evaluator.evaluate(pairing.pairs),
+            T_est=np.array(estimated, np.float64).reshape(-1, 4, 4),
+            T_gt=np.array([pair.truth.T_cam_obj for pair in pairing.pairs], np.float64).reshape(-1, 4, 4),
+            ignored=pairing.ignored,
+        )
+
+
+def _side_of(scored: Scored) -> Side:
+    file = scored.file
+    return Side(name=file.name, path=file.path, sha256=file.sha256, table=scored.table, scored=scored)
+
+
+def _renamed(sides: Sequence[Side]) -> tuple[Side, Side]:
+    """Names that differ."""
+    a, b = sides
+    if a.name != b.name:
+        return a, b
+    return _named(a, f"{a.name} (A)"), _named(b, f"{b.name} (B)")
+
+
+def _named(side: Side, name: str) -> Side:
+    return Side(name=name, path=side.path, sha256=side.sha256, table=side.table, scored=side.scored)
+
+
+def is_table_of_errors(path: Path) -> bool:
+    """Whether a file is an `estimates.csv` of a report, by its first line.
+
+    Raises:
+        ResultFileError: the file cannot be read.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as stream:
+            head = stream.readline(10_000)
+    except OSError as error:
+        raise ResultFileError(
+            f"{path}: cannot be read ({error.strerror}); give a BOP result file or a report's estimates.csv"
+        ) from error
+    return {"scene_id", "gt_index"} <= {name.strip() for name in head.split(",")}
+
+
+def read_errors(path: Path, name: str | None = None) -> Side:
+    """Read the lines of one result file from a table of errors.
+
+    Args:
+        path: an `estimates.csv` of a report.
+        name: of the result file, as the table's column `results` has it. Not needed where there is one only.
+
+    Raises:
+        ResultFileError: columns are missing, or a line holds something else than numbers.
+        ConfigError: the table holds several result files and none is named, or not this one.
+    """
+    rows = _rows(path)
+    named = rows[NAMES_COLUMN] if NAMES_COLUMN in rows else pd.Series(path.stem, index=rows.index)
+    names = list(dict.fromkeys(named))
+    if name is None and len(names) > 1:
+        raise ConfigError(f"{path}: holds {', '.join(names)}; say which with --result-a and --result-b")
+    if name is not None and name not in names:
+        raise ConfigError(f"{path}: has no result file '{name}'; it holds {', '.join(names)}")
+    chosen = name or (names[0] if names else path.stem)
+    return Side(
+        name=chosen,
+        path=path,
+        sha256=sha256_file(path),
+        table=_typed(rows[named == chosen].drop(columns=NAMES_COLUMN, errors="ignore"), path),
+    )
+
+
+def _rows(path: Path) -> pd.DataFrame:
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            lines = list(csv.reader(stream))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ResultFileError(f"{path}: cannot be read as CSV ({error})") from error
+    head = [name.strip() for name in lines[0]]
+    body = {number: line for number, line in enumerate(lines[1:], start=2) if any(part.strip() for part in line)}
+    for number, line in body.items():
+        if len(line) != len(head):
+            raise ResultFileError(f"{path}:{number}: found {len(line)} fields, expected {len(head)} as in the header")
+    missing = [name for name in COLUMNS if name not in head]
+    if missing:
+        raise ResultFileError(
+            f"{path}:1: no column {', '.join(missing)}; write the table again with this version's evalkit report"
+        )
+    return pd.DataFrame(list(body.values()), columns=head, index=list(body))
+
+
+def _typed(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
+    """Numbers; the index holds line numbers until here."""
+    table = pd.DataFrame(index=rows.index)
+    for name in rows.columns:
+        text = rows[name].str.strip()
+        numbers = pd.to_numeric(text, errors="coerce")
+        dtype = COLUMNS[name].dtype if name in COLUMNS else "float64"
+        wrong = numbers.isna() & ((text != "") | (dtype != "float64"))
+        if dtype != "float64":
+            wrong |= numbers.fillna(0) % 1 != 0
+        if dtype == "bool":
+            wrong |= ~numbers.isin([0, 1])
+        wrong &= text.str.lower() != "nan"
+        if wrong.any() and name not in COLUMNS:
+            continue  # a column of words that a report added
+        if wrong.any():
+            line = int(wrong.idxmax())
+            expected = {"float64": "a number", "int64": "a whole number", "bool": "0 or 1"}[dtype]
+            raise ResultFileError(f"{path}:{line}: {name} is '{text[line][:40]}', expected {expected}")
+        table[name] = numbers.astype(dtype)
+    return table.reset_index(drop=True)

@@ -1,0 +1,87 @@
+"""Pieces of a page: sections, paragraphs, lists of terms, cases with pictures. Every text is escaped here."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+
+
+@dataclass(frozen=True, kw_only=True)
+class Shot:
+    """One picture of a case: which result file, the image as a data URL, and a line below it."""
+
+    name: str
+    url: str
+    caption: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Section:
+    """A headed part of a page; one without parts is left out."""
+
+    heading: str
+    parts: Sequence[str]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether it has nothing to show."""
+        return not any(self.parts)
+
+    @property
+    def anchor(self) -> str:
+        """Its place in the page, unique as headings are."""
+        return "".join(char if char.isalnum() else "-" for char in self.heading.lower())
+
+
+def case(title: str, shots: Sequence[Shot]) -> str:
+    """The same pose as several result files have it, side by side."""
+    figures = "".join(
+        f'<figure><img src="{shot.url}" alt="{escape(title)}: {escape(shot.name)}, {escape(shot.caption)}" '
+        'width="300" height="300" decoding="async">'
+        f"<figcaption><b>{escape(shot.name)}</b><br>{escape(shot.caption)}</figcaption></figure>"
+        for shot in shots
+    )
+    return f'<article class="case"><h3>{escape(title)}</h3><div class="shots">{figures}</div></article>'
+
+
+def cases(articles: Sequence[str], shots_each: int) -> str:
+    """A grid of cases, each wide enough for its pictures."""
+    width = 20 + 190 * max(1, min(shots_each, 4))
+    return f'<div class="cases" style="--case: {width}px">{"".join(articles)}</div>'
+
+
+def definitions(entries: Mapping[str, str]) -> str:
+    """Terms and what they mean."""
+    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries.items())
+    return f"<dl>{items}</dl>" if items else ""
+
+
+def text(plain: str) -> str:
+    """Plain text as HTML."""
+    return escape(plain)
+
+
+def heading(text: str) -> str:
+    """A heading within a section."""
+    return f"<h3>{escape(text)}</h3>"
+
+
+def paragraph(text: str, soft: bool = False) -> str:
+    """Plain text."""
+    return f'<p class="soft">{escape(text)}</p>' if soft else f"<p>{escape(text)}</p>"
+
+
+def items(texts: Sequence[str]) -> str:
+    """A list."""
+    return f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>" if texts else ""
+
+
+def fold(label: str, *parts: str) -> str:
+    """Parts that are shown on demand, and on paper."""
+    content = "".join(parts)
+    return f"<details><summary>{escape(label)}</summary>{content}</details>" if content else ""
+
+
+def beside(*parts: str) -> str:
+    """Parts side by side where there is room."""
+    content = "".join(part for part in parts if part)
+    return f'<div class="beside">{content}</div>' if content else ""

@@ -1,0 +1,153 @@
+"""What is left between tracked and true poses, in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
+
+Objects with symmetries take it to the copy of the truth that lies nearest in rotation.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from posecore import se3
+from posecore.symmetry import Symmetric, align_ball, is_ball
+
+Array = np.ndarray
+TIE_RAD = 1e-6
+"""Copies of a symmetric object whose residual angles differ by less are equally near."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Residuals:
+    """What is left between estimates and truths, in camera axes; NaN where there is no estimate.
+
+    Attributes:
+        R: (n, 3, 3) `R_est R_gt^-1`.
+        dt_m: (n, 3) `t_est - t_gt`.
+    """
+
+    R: Float[Array, "n 3 3"]
+    dt_m: Float[Array, "n 3"]
+
+    @property
+    def angle_rad(self) -> Float[Array, " n"]:
+        """Rotation error."""
+        return se3.rotation_angle_rad(self.R)
+
+    @property
+    def distance_m(self) -> Float[Array, " n"]:
+        """Distance of the origins."""
+        return np.asarray(np.linalg.norm(self.dt_m, axis=1))
+
+
+def residuals(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None) -> Residuals:
+    """Residuals of a sequence, frames in order.
+
+    Args:
+        T_est: estimates `T_cam_obj`, metres, NaN where there is none.
+        T_gt: truths.
+        info: symmetries of the object, None for none.
+    """
+    R, dt_m = _to_copies(T_est[:, :3, :3], T_est, T_gt, info)
+    chosen = _nearest_copies(R)
+    rows = np.arange(len(T_est))
+    return Residuals(R=R[rows, chosen], dt_m=dt_m[rows, chosen])
+
+
+def _nearest_copies(R: Float[Array, "n s 3 3"]) -> Int[Array, " n"]:
+    """Copy with the smallest angle in each frame; of equal ones the nearest to the residual of the frame before."""
+    angle = np.where(np.isnan(R[..., 0, 0]), np.inf, se3.rotation_angle_rad(R))
+    chosen = np.asarray(angle.argmin(axis=1))
+    smallest = angle.min(axis=1)
+    ties = angle <= smallest[:, None] + TIE_RAD
+    for row in np.flatnonzero(np.isfinite(smallest[1:]) & (ties[1:].sum(axis=1) > 1)) + 1:
+        before = R[row - 1, chosen[row - 1]]
+        if np.isfinite(before).all():
+            equal = np.flatnonzero(ties[row])
+            chosen[row] = equal[se3.rotation_angle_rad(R[row, equal] @ before.T).argmin()]
+    return chosen
+
+
+def changes(
+    T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """By how much the residual changes from each frame to the next (m = n - 1): metres and radians; NaN beside a gap.
+
+    The later frame's residual is to the copy of the truth that is nearest to the earlier frame's residual.
+    """
+    found = residuals(T_est, T_gt, info)
+    before_R, before_t = found.R[:-1], found.dt_m[:-1]
+    back = np.swapaxes(before_R, -1, -2) @ T_est[1:, :3, :3]
+    R, dt_m = _to_copies(back, T_est[1:], T_gt[1:], info)
+    turned = se3.rotation_angle_rad(R @ np.swapaxes(before_R, -1, -2)[:, None])
+    chosen = np.where(np.isnan(turned), np.inf, turned).argmin(axis=1)
+    rows = np.arange(len(chosen))
+    moved = np.linalg.norm(dt_m[rows, chosen] - before_t, axis=1)
+    return np.asarray(moved), np.asarray(turned[rows, chosen])
+
+
+def _to_copies(
+    R_near: Float[Array, "n 3 3"], T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
+) -> tuple[Float[Array, "n s 3 3"], Float[Array, "n s 3"]]:
+    """Residuals to the copies of the truth: one for each discrete symmetry.
+
+    Where there is an axis of rotation, each copy is turned about it so that it comes as near as possible to `R_near`,
+    exactly: sampled turns would put their step into the residual and shake it from frame to frame.
+    """
+    copies = T_gt[:, None] @ _symmetries(R_near, T_gt, info)
+    R = T_est[:, None, :3, :3] @ np.swapaxes(copies[..., :3, :3], -1, -2)
+    gone = np.isnan(R).any(axis=(-2, -1), keepdims=True)
+    # Annotations are orthonormal to three digits only. A rotation times a stretch has that rotation as its nearest one,
+    # so transposing instead of inverting the truth costs nothing.
+    R = np.where(gone, np.nan, se3.nearest_rotation(np.where(gone, np.eye(3), R)))
+    return np.asarray(R), np.asarray(T_est[:, None, :3, 3] - copies[..., :3, 3])
+
+
+def _symmetries(
+    R_near: Float[Array, "n 3 3"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
+) -> Float[Array, "n s 4 4"]:
+    fixed = np.stack([np.eye(4), *(info.symmetries_discrete if info is not None else ())])
+    fixed = np.broadcast_to(fixed, (len(T_gt), *fixed.shape))
+    axes = info.symmetries_continuous if info is not None else ()
+    if not axes:
+        return fixed
+    if is_ball(axes):
+        near = [align_ball(axes, truth, se3.make_T(R, np.zeros(3))) for truth, R in zip(T_gt, R_near, strict=True)]
+        return np.array(near).reshape(-1, 1, 4, 4)
+    turn = np.linalg.inv(T_gt[:, :3, :3])[:, None] @ R_near[:, None] @ np.swapaxes(fixed[..., :3, :3], -1, -2)
+    return np.asarray(_turns_nearest(turn, np.array(axes[0].axis), np.array(axes[0].offset_m)) @ fixed)
+
+
+def _turns_nearest(
+    M: Float[Array, "n s 3 3"], axis: Float[Array, "3"], offset_m: Float[Array, "3"]
+) -> Float[Array, "n s 4 4"]:
+    """The turn C about a line that brings `M C^T` nearest to the identity.
+
+    The trace of `M C^T` is a constant plus `cos * (trace M - a M a) + sin * (a . w)`, with w the vector of the skew
+    part of M: the angle of its largest value is an arc tangent.
+    """
+    skew = np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
+    along = np.einsum("i,...ij,j->...", axis, M, axis)
+    angle = np.arctan2(skew @ axis, np.trace(M, axis1=-2, axis2=-1) - along)
+    R = se3.rotation_from_rotvec(np.nan_to_num(angle)[..., None] * axis)
+    return se3.make_T(R, offset_m - R @ offset_m)
+
+
+def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """Roll, pitch, yaw in degrees with `R = Rz(yaw) Ry(pitch) Rx(roll)`: roll and yaw in (-180, 180], pitch in +-90.
+
+    This is PCL's convention (`getTranslationAndEulerAngles`); the paper does not name its own.
+    """
+    roll = np.arctan2(R[..., 2, 1], R[..., 2, 2])
+    pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
+    yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
+    return np.asarray(np.rad2deg(np.stack([roll, pitch, yaw], axis=-1)))
+
+
+def legacy_angles_deg(R_est: Float[Array, "n 3 3"], R_gt: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
+    """Differences of the unwrapped Euler angles of estimates and truths, degrees, as old tables have them.
+
+    Two rotations that are close can be far apart in these angles, where the pitch is near 90 degrees. The difference in
+    the first frame is brought within half a turn, so that 359 degrees against 1 is 2 degrees.
+    """
+    est, gt = (np.unwrap(euler_deg(se3.nearest_rotation(R)), period=360.0, axis=0) for R in (R_est, R_gt))
+    difference = est - gt
+    return np.asarray(difference - 360.0 * np.round(difference[:1] / 360.0))

@@ -1,0 +1,54 @@
+"""Bytes at rest: a file of its own, or a member of a tar file, read without unpacking."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from posecore.errors import DatasetError
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredFile:
+    """A file, or a part of one.
+
+    Attributes:
+        path: the file on disk.
+        member: name inside the tar file, empty where the file is meant as a whole.
+        offset: where its bytes start.
+        size: how many there are; None for up to the end.
+    """
+
+    path: Path
+    member: str = ""
+    offset: int = 0
+    size: int | None = None
+
+    def __str__(self) -> str:
+        return f"{self.path}:{self.member}" if self.member else str(self.path)
+
+    @property
+    def suffix(self) -> str:
+        """Extension with its dot, lower case."""
+        return Path(self.member or self.path.name).suffix.lower()
+
+    def read(self, limit: int | None = None) -> bytes:
+        """The bytes, or the first `limit` of them.
+
+        Raises:
+            DatasetError: the file is missing, cannot be read or is shorter than it should be.
+        """
+        wanted = self.size if limit is None or (self.size is not None and self.size < limit) else limit
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(self.offset)
+                data = stream.read() if wanted is None else stream.read(wanted)
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or str(error)
+            raise DatasetError(f"{self}: cannot be read ({reason}); copy it again") from error
+        if self.member and wanted is not None and len(data) < wanted:
+            raise DatasetError(f"{self}: found {len(data)} of {wanted} bytes; the tar file is cut off, copy it again")
+        return data
+
+
+def stored(file: "Path | StoredFile") -> StoredFile:
+    """A path as a stored file."""
+    return file if isinstance(file, StoredFile) else StoredFile(path=file)

@@ -1,0 +1,96 @@
+"""ASCII PLY files held against their own header: what a lenient reader would skip, shift or round is refused."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from posecore.errors import MeshError
+
+_NO_NUMBERS = (b"nan", b"inf", b"infinity")  # refused with the vertex they are in
+_NUMBER_CHARACTERS = b"0123456789+-.eE \t\r\n"
+
+
+@dataclass(kw_only=True)
+class _Element:
+    name: str
+    count: int
+    is_list: list[bool] = field(default_factory=list)
+
+
+def refuse_broken_ply(file: Path, data: bytes) -> None:
+    """Refuse an ASCII PLY whose rows are not what its header says.
+
+    Readers take a file that is cut off for one with fewer faces, `3O.5` for 3 and `10-20` for two numbers. Binary files
+    are left alone: their length gives them away.
+
+    Args:
+        file: for the error.
+        data: its bytes.
+
+    Raises:
+        MeshError: rows are missing, or one holds something that is no number, too few or too many; names the line.
+    """
+    head, end, body = data.partition(b"end_header")
+    lines = head.decode("ascii", "replace").splitlines()
+    if not end or not any(line.split()[:2] == ["format", "ascii"] for line in lines):
+        return
+    rows = body.partition(b"\n")[2].splitlines()
+    first_line = len(lines) + 2
+    row = 0
+    for element in _elements(lines):
+        there = sum(bool(text.strip()) for text in rows[row:])
+        if there < element.count:
+            raise MeshError(
+                f"{file}: has {there} rows of '{element.name}', its header says {element.count}; the file is cut off"
+            )
+        for text in rows[row : row + element.count]:
+            reason = _wrong_row(text, element)
+            if reason:
+                raise MeshError(f"{file}:{first_line + row}: the {element.name} {reason}; export the mesh again")
+            row += 1
+
+
+def _elements(lines: list[str]) -> Iterator[_Element]:
+    element: _Element | None = None
+    for line in lines:
+        words = line.split()
+        if len(words) == 3 and words[0] == "element" and words[2].isdigit():
+            if element is not None:
+                yield element
+            element = _Element(name=words[1], count=int(words[2]))
+        elif len(words) >= 3 and words[0] == "property" and element is not None:
+            element.is_list.append(words[1] == "list")
+    if element is not None:
+        yield element
+
+
+def _wrong_row(text: bytes, element: _Element) -> str:
+    """What is wrong in a row, or nothing."""
+    words = text.split()
+    if text.translate(None, _NUMBER_CHARACTERS) and any(
+        word.translate(None, _NUMBER_CHARACTERS) and word.lower().strip(b"+-") not in _NO_NUMBERS for word in words
+    ):
+        return f"is '{text[:60].decode('ascii', 'replace').strip()}', expected numbers"
+    if not all(map(_is_number, words)):
+        return f"is '{text[:60].decode('ascii', 'replace').strip()}', expected numbers"
+    position = 0
+    for is_list in element.is_list:
+        if not is_list:
+            position += 1
+            continue
+        if position >= len(words) or not words[position].isdigit():
+            return "has no count of its list"
+        size = int(words[position])
+        inside = words[position + 1 : position + 1 + size]
+        if element.name == "face" and position == 0 and not all(word.isdigit() for word in inside):
+            return "names a vertex by something that is no whole number"
+        position += 1 + size
+    return "" if position == len(words) else f"has {len(words)} numbers, its header says {position}"
+
+
+def _is_number(word: bytes) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
