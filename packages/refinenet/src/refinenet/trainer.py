@@ -1,5 +1,6 @@
 """What a training run is made of: data, network, loss, optimiser, and the step that joins them."""
 
+import gc
 import math
 import os
 from pathlib import Path
@@ -178,8 +179,14 @@ class Trainer:
         checkpoint.drop_states(self.out, self.step)
 
     def close(self) -> None:
-        """Leave the process group."""
+        """Leave the process group.
+
+        The reducer goes first: were it the last owner of the group, its destructor would wait, with Python's lock
+        held, for a thread that needs that lock.
+        """
         if self.world > 1:
+            self._parallel = self.network
+            gc.collect()
             torch.distributed.destroy_process_group()
 
 
