@@ -1,0 +1,24 @@
+"""The `refinenet` command: one module for each of its commands."""
+
+import click
+
+from refinenet.cli.group import CleanGroup
+from refinenet.cli.refine import refine
+from refinenet.cli.train import train
+
+_CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
+
+
+@click.group(cls=CleanGroup, context_settings=_CONTEXT)
+@click.version_option(package_name="refinenet")
+def main() -> None:
+    """Train pose refinement networks and refine poses with them.
+
+    \b
+    refinenet train shards/
+    refinenet refine --checkpoint runs/compact/best.safetensors --dataset lmo --init start.csv --out refined.csv
+    """
+
+
+for _command in (refine, train):
+    main.add_command(_command)

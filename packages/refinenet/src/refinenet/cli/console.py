@@ -1,0 +1,38 @@
+"""What the commands show while they work."""
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+
+def start_logging(verbose: bool) -> None:
+    """Log to stderr: warnings, or details too."""
+    logging.basicConfig(
+        level=logging.INFO if verbose else logging.WARNING, format="%(levelname)s %(name)s: %(message)s"
+    )
+
+
+@contextmanager
+def stoppable(where: Path) -> Iterator[None]:
+    """Ctrl-C ends with one line."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        click.echo(f"Stopped; what was finished is in {where}", err=True)
+        raise SystemExit(130) from None
+
+
+def progress_bar(quiet: bool, *extra: str) -> "Progress":
+    """A bar on stderr, with more columns after its own."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, *map(TextColumn, extra), console=Console(stderr=True), disable=quiet)

@@ -1,0 +1,16 @@
+"""What several commands' options have in common."""
+
+from pathlib import Path
+
+import click
+
+FILE = click.Path(path_type=Path)
+NEW_FILE = click.Path(path_type=Path, dir_okay=False)
+device_option = click.option(
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", help="Where the network runs."
+)
+threads_option = click.option(
+    "--threads", type=click.IntRange(0), default=0, help="Torch threads; 0 leaves torch's choice."
+)
+quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
+verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")

@@ -1,0 +1,144 @@
+"""`refinenet train`."""
+
+import json
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from refinenet.cli.console import progress_bar, start_logging, stoppable
+from refinenet.cli.options import FILE, quiet_option, verbose_option
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+
+PRESETS = ("paper", "compact")
+LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
+
+log = logging.getLogger(__name__)
+
+
+@click.command()
+@click.argument("shards", type=str)
+@click.option("--preset", type=click.Choice(PRESETS), default="compact", help="Which network and how it is trained.")
+@click.option("--config", "file", type=FILE, metavar="FILE", help="YAML laid over the preset.")
+@click.option(
+    "--set", "overrides", multiple=True, metavar="KEY=VALUE",
+    help="Change one configuration key, e.g. --set optimiser.lr=1e-4. Repeatable; last wins.",
+)  # fmt: skip
+@click.option("--steps", type=click.IntRange(1), help="Optimiser steps. [preset]")
+@click.option("--batch", type=click.IntRange(1), help="Pairs in a step. [preset]")
+@click.option("--loss", type=click.Choice(LOSSES), help="Loss. [preset]")
+@click.option("--seed", type=click.IntRange(0), help="Of weights, order, hypotheses, augmentation. [preset, 0]")
+@click.option("--workers", type=click.IntRange(0), help="Loader processes; 0 loads in the training process. [preset]")
+@click.option("--threads", type=click.IntRange(0), help="Torch threads; 0 leaves torch's choice. [preset, 0]")
+@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network runs. [preset, auto]")
+@click.option(
+    "--backbone-weights", type=FILE, metavar="FILE", help="ImageNet weights of preset paper's stem (safetensors)."
+)
+@click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
+@click.option("--resume", is_flag=True, help="Go on with the run in --out.")
+@quiet_option
+@verbose_option
+def train(
+    shards: str,
+    preset: str,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    backbone_weights: Path | None,
+    out: Path | None,
+    resume: bool,
+    quiet: bool,
+    verbose: bool,
+    steps: int | None,
+    batch: int | None,
+    loss: str | None,
+    seed: int | None,
+    workers: int | None,
+    threads: int | None,
+    device: str | None,
+) -> None:
+    """Train on SHARDS, a dataset made by `synthgen render` (folder or fsspec URL).
+
+    Writes best.safetensors, last.safetensors, metrics.jsonl, TensorBoard events and config.yaml.
+
+    \b
+    refinenet train shards/ --steps 4000
+    refinenet train shards/ --preset paper --backbone-weights inception_v4.safetensors --out runs/benchvise
+    refinenet train shards/ --set hypothesis.max_angle_deg=40 --set optimiser.lr=3e-4
+    refinenet train shards/ --out runs/benchvise --resume
+    torchrun --nproc-per-node 4 -m refinenet train s3://bucket/shards --preset paper
+    """
+    start_logging(verbose)
+    from refinenet.config import load_config
+    from refinenet.train import train as run
+
+    named = {
+        "steps": steps, "batch": batch, "loss.name": loss, "seed": seed, "loader.workers": workers, "threads": threads,
+        "device": device,
+        # quoted: a path may hold what YAML reads as a comment
+        "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
+    }  # fmt: skip
+    assigned = [*overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
+    config = load_config(preset, assigned, file)
+    folder = out or Path("runs") / preset
+    with stoppable(folder), _quiet_threads(), _training_bar(config.steps, quiet) as report:
+        errors = run(config, shards, folder, resume=resume, report=report)
+    for line in _comparison(errors):
+        click.echo(line)
+    click.echo(f"{folder / 'best.safetensors'}")
+
+
+def _comparison(errors: dict[str, float]) -> Iterator[str]:
+    """Held-out errors, start beside refined."""
+    rows = (
+        ("rotation, mean", "rotation", "deg"), ("rotation, median", "rotation_median", "deg"),
+        ("x", "x", "mm"), ("y", "y", "mm"), ("z", "z", "mm"), ("points (ADD)", "add", "mm"),
+    )  # fmt: skip
+    yield "held-out scenes, one update    start  refined"
+    for label, key, unit in rows:
+        before, after = errors[f"validation/{key}_before_{unit}"], errors[f"validation/{key}_after_{unit}"]
+        yield f"{label + ', ' + unit:<26}{before:10.2f}{after:9.2f}"
+
+
+@contextmanager
+def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
+    """A progress line with the loss and where a step's time goes, and one line for each validation."""
+    bar = progress_bar(quiet, "{task.fields[state]}")
+    task: TaskID = bar.add_task("steps", total=steps, state="first batches")
+
+    def report(step: int, values: dict[str, float]) -> None:
+        bar.start()  # at the first report, not before: an error in settings or data comes out on a line of its own
+        if "validation/add_after_mm" in values:
+            if not quiet:
+                move = "  ".join(
+                    f"{key} {values[f'validation/{key}_before_{unit}']:.2f} -> "
+                    f"{values[f'validation/{key}_after_{unit}']:.2f} {unit}"
+                    for key, unit in (("rotation", "deg"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("add", "mm"))
+                )
+                bar.console.print(f"step {step}  {move}", highlight=False, soft_wrap=True)
+            return
+        loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss_"))
+        timing = f"data wait {values['data_wait_ms']:.0f} ms, compute {values['compute_ms']:.0f} ms"
+        bar.update(task, completed=step, state=f"{loss}  {timing}")
+
+    try:
+        yield report
+    finally:
+        if bar.live.is_started:  # stopping one that never started prints an empty line
+            bar.stop()
+
+
+@contextmanager
+def _quiet_threads() -> Iterator[None]:
+    """TensorBoard's writing thread hands its error to the training thread, which reports it, and prints a traceback."""
+    before = threading.excepthook
+    threading.excepthook = lambda ended: log.info("%s: %s", ended.thread and ended.thread.name, ended.exc_value)
+    try:
+        yield
+    finally:
+        threading.excepthook = before
