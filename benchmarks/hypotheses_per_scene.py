@@ -20,10 +20,10 @@ import numpy as np
 from refinenet import checkpoint, metrics
 from refinenet.config import TrainConfig, load_config
 from refinenet.data import PairSource, Split, spread_rows, validation_batches
+from refinenet.device import choose_device
 from refinenet.loss import ObjectPoints
 from refinenet.objects import load_meshes, load_models, object_points
 from refinenet.train import train
-from refinenet.trainer import choose_device
 
 PATCH_PX = 64
 TEST_PAIRS = 1024

@@ -17,8 +17,8 @@ from posecore.window import Window, cut, diameter_window, fixed_window
 
 from refinenet import checkpoint
 from refinenet.checkpoint import Checkpoint
+from refinenet.device import choose_device
 from refinenet.network import Pair
-from refinenet.trainer import choose_device
 
 Array = np.ndarray
 STOP_ANGLE_DEG = 1.5

@@ -1,33 +1,35 @@
 """What a training run is made of: data, network, loss, optimiser, and the step that joins them."""
 
 import gc
+import hashlib
+import json
+import logging
 import math
 import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
 
 import torch
-from posecore.errors import CheckpointError, ConfigError
-from torch import nn
+from posecore.errors import CheckpointError, ConfigError, ShardError
+from posecore.shard import ShardReader, n_shards
+from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from refinenet import backbone, checkpoint, metrics
-from refinenet.config import OptimiserConfig, TrainConfig
-from refinenet.data import Batch, PairSource, PairStream, make_loader, split_by_scene, spread_rows, validation_batches
-from refinenet.errors import TrainingError
+from refinenet.config import TrainConfig
+from refinenet.data import Batch, PairSource, PairStream, make_loader, on_device, validation_batches
 from refinenet.loss import make_loss
 from refinenet.network import PaperNet, make_network
 from refinenet.objects import load_meshes, load_models, object_points
+from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
+from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows
 
+log = logging.getLogger(__name__)
 
-def learning_rate(step: int, steps: int, config: OptimiserConfig) -> float:
-    """Rate of step `step` (from 0) of `steps`: linear warm-up, then constant or a cosine down to a hundredth."""
-    if step < config.warmup_steps:
-        return config.lr * (step + 1) / config.warmup_steps
-    if config.schedule == "constant":
-        return config.lr
-    progress = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
-    return config.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
+FOLLOW_POLL_S = 2.0
+"""Time between looks at a growing dataset that has too few shards to begin with."""
 
 
 def choose_device(name: str) -> torch.device:
@@ -50,8 +52,25 @@ def use_bfloat16(precision: str, device: torch.device) -> bool:
     return precision == "bfloat16"
 
 
+@contextmanager
+def process_group(config: TrainConfig) -> Iterator[None]:
+    """The processes that torchrun started, joined; without torchrun, nothing."""
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        yield
+        return
+    device = choose_device(config.device)
+    if device.type == "cuda":
+        torch.cuda.set_device(device)
+    torch.distributed.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    try:
+        yield
+    finally:
+        gc.collect()
+        torch.distributed.destroy_process_group()
+
+
 class Trainer:
-    """A run, ready to step.
+    """A run, ready to step; under torchrun, within `process_group`.
 
     Args:
         config: Everything but data and place.
@@ -62,6 +81,7 @@ class Trainer:
     Attributes:
         step: Optimiser steps taken.
         best_mm: Smallest held-out point distance so far.
+        skipped: What is wrong with each shard that was skipped.
     """
 
     def __init__(self, config: TrainConfig, url: str, out: Path, *, resume: bool = False) -> None:
@@ -69,141 +89,241 @@ class Trainer:
             torch.set_num_threads(config.threads)
         torch.manual_seed(config.seed)
         torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
-        self.config, self.out = config, out
+        self.config, self.out, self._url = config, out, url
         self.rank, self.world = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
         self.device = choose_device(config.device)
         self._reduced = use_bfloat16(config.precision, self.device)
-        self._url = url
-        held_out = PairSource(url, config, training=False)
-        reader = held_out.reader
-        try:
-            self.training, self.validation = split_by_scene(reader, config.validation.scene_share, config.seed)
-            measured = spread_rows(self.validation, config.validation.pairs)
-            # Rendered once and kept: the same pairs are measured every time, without a context in this process.
-            self._held_out = list(validation_batches(held_out, measured, config.batch))
-        finally:
-            held_out.close()
+        self.skipped: dict[str, None] = {}
+        last = self._last() if resume else None
+        reader = ShardReader(url)
+        self.training, self.validation, self._record = self._split(reader, resume=resume)
+        self._held_out = self._make_held_out()
         points = object_points(
             load_meshes(reader), load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg
         )
         self.objects = points.to(self.device)
-        self._dataset_sha256, self._objects_card = reader.digest, reader.card["objects"]
+        self._dataset_sha256, self._objects_card = _dataset_sha256(reader, config), reader.card["objects"]
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
-        self.network = make_network(config.network).to(self.device)
+        self.network = make_network(config.network).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._loss = make_loss(
             config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
             rotation_weight=config.loss.rotation_weight, objects=self.objects,
         )  # fmt: skip
         self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
-        self._optimiser = _optimiser(self.network, config.optimiser)
+        self._optimiser = make_optimiser(self.network, config.optimiser)
+        self._guard = FiniteGuard(self._optimiser, self.device, late=self.device.type == "cuda")
         self.step, self.best_mm = 0, math.inf
-        if resume:
-            self._resume()
-        elif isinstance(self.network, PaperNet) and config.network.backbone.pretrained:
+        if last is None and isinstance(self.network, PaperNet) and config.network.backbone.pretrained:
             stem = config.network.backbone
             backbone.load_pretrained(self.network.stem, stem.name, stem.weights)
+        decay = config.optimiser.ema_decay
+        self._average = RunningAverage(self.network, decay) if decay else None
+        if last is not None:
+            self._resume(last)
         self._parallel = self._distribute()
+        self._forward = torch.compile(self._parallel) if config.compile else self._parallel
 
-    def _resume(self) -> None:
+    @property
+    def kept(self) -> nn.Module:
+        """The network that is measured and saved: the running average where there is one."""
+        return self.network if self._average is None else self._average.network
+
+    def _last(self) -> checkpoint.Checkpoint:
         last = checkpoint.load(self.out / "last.safetensors", self.config.preset)
         checkpoint.require_same(last.provenance.config, self.config, last.path)
+        return last
+
+    def _split(self, reader: ShardReader, *, resume: bool) -> tuple[Split, Split, DataRecord]:
+        """Both sides of the split, the same on every rank: rank 0 decides, or reads what the run began with."""
+        settings, skip = self.config.loader, self.config.loader.skip_bad_shards
+        shared: list[DataRecord | None] = [None]
+        if self.rank == 0:
+            if resume:
+                shared = [DataRecord.load(self.out)]
+            else:
+                if settings.follow:
+                    _wait_for_shards(reader, self.world * max(1, settings.workers))
+                scene_of, _ = read_scenes(reader, reader.committed, skip=skip)
+                held = held_out_scenes(reader.url, scene_of, self.config.validation.scene_share, self.config.seed)
+                record = DataRecord(shards=tuple(scene_of), held_out=tuple(int(scene) for scene in held))
+                record.save(self.out)
+                shared = [record]
+        if self.world > 1:
+            torch.distributed.broadcast_object_list(shared, src=0)
+        (record,) = shared
+        assert record is not None
+        reader.refresh()
+        begun = reader.committed if not settings.follow else record.shards
+        scene_of, bad = read_scenes(reader, begun, skip=skip)
+        self._tell_skipped(*bad.values())
+        return (*divide({s: scene_of[s] for s in record.shards if s in scene_of}, record.held_out), record)
+
+    def _make_held_out(self) -> list[Batch]:
+        """Held-out pairs, made once and kept: the same are measured every time, without a GL context in this process.
+
+        Raises:
+            ShardError: None can be read.
+        """
+        if self.rank != 0:
+            return []
+        source = PairSource(self._url, self.config, training=False)
+        try:
+            measured = spread_rows(self.validation, self.config.validation.pairs)
+            batches = list(validation_batches(source, measured, self.config.batch))
+        finally:
+            source.close()
+        if not batches:
+            raise ShardError(f"{self._url}: no held-out pair can be read; render its damaged shards again")
+        for batch in batches:
+            self._tell_skipped(*batch.skipped)
+        return batches
+
+    def _tell_skipped(self, *messages: str) -> None:
+        for message in messages:
+            if message not in self.skipped:
+                self.skipped[message] = None
+                log.warning("skipped: %s", message)
+
+    def _resume(self, last: checkpoint.Checkpoint) -> None:
         if last.provenance.dataset_sha256 != self._dataset_sha256:
             raise CheckpointError(f"{last.path}: was trained on other data than {self._url}; start a new run")
-        self.network.load_state_dict(last.tensors)
         state = checkpoint.load_state(self.out, last.provenance.step)
+        if state["world"] != self.world:
+            raise ConfigError(
+                f"{last.path}: was trained by {state['world']} processes and now there are {self.world}; resume with "
+                f"torchrun --nproc-per-node {state['world']}"
+            )
+        self.network.load_state_dict(last.tensors if self._average is None else state["weights"])
+        if self._average is not None:
+            self._average.network.load_state_dict(last.tensors)
         self._optimiser.load_state_dict(state["optimiser"])
         self.step, self.best_mm = last.provenance.step, float(state["best_mm"])
 
     def _distribute(self) -> nn.Module:
         if self.world == 1:
             return self.network
-        torch.distributed.init_process_group("nccl" if self.device.type == "cuda" else "gloo")
         return DistributedDataParallel(self.network, device_ids=[self.device] if self.device.type == "cuda" else None)
 
-    def stream(self) -> Any:
-        """Iterator of training batches from the present step on."""
-        workers = max(1, min(self.config.loader.workers, len(self.training.rows) // self.world))
+    def stream(self) -> Iterator[Batch]:
+        """Training batches on the device, from the present step on."""
+        settings = self.config.loader
+        workers = max(1, min(settings.workers, len(self.training.rows) // self.world))
+        growth = Growth(out=self.out, record=self._record, skip_bad_shards=settings.skip_bad_shards)
         stream = PairStream(
             url=self._url, config=self.config, split=self.training, rank=self.rank, world=self.world, workers=workers,
-            start=self.step,
+            start=self.step * self.config.optimiser.accumulate, growth=growth if settings.follow else None,
         )  # fmt: skip
-        return iter(make_loader(stream))
+        return on_device(iter(make_loader(stream, pin=self.device.type == "cuda")), self.device)
 
-    def take_step(self, batch: Batch) -> dict[str, float]:
-        """One optimiser step.
+    def take_step(self, *batches: Batch) -> dict[str, float | Tensor]:
+        """One optimiser step on the mean gradient of one or more batches.
 
         Returns:
-            The batch's mean loss and the step's learning rate.
+            The mean loss, the gradient's norm (both still on the device) and the step's learning rate.
 
         Raises:
-            TrainingError: A loss or the gradient is not finite; nothing was changed. Samples are named.
+            TrainingError: A loss or the gradient is not finite; the weights were left alone. Samples are named. On a
+                GPU this is found one step late, or by `settle`.
         """
         self._parallel.train()
-        batch = batch.to(self.device)
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-            update = self._parallel(batch.pair)
-        losses = self._loss(update, batch.target)
-        finite = torch.isfinite(losses)
-        if not bool(finite.all()):
-            raise TrainingError(_not_finite("loss", self.step, batch.sample_ids[~finite.cpu()]))
-        loss = losses.mean()
         self._optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        limit = self.config.optimiser.gradient_clip or math.inf
-        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), limit)
-        if not bool(torch.isfinite(norm)):
-            raise TrainingError(_not_finite("gradient", self.step, batch.sample_ids))
+        losses = []
+        for i, batch in enumerate(batches):
+            self._tell_skipped(*batch.skipped)
+            batch = batch.to(self.device)
+            with self._apart() if i < len(batches) - 1 else nullcontext():
+                with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
+                    update = self._forward(batch.pair)
+                losses.append(self._loss(update, batch.target))
+                (losses[-1].mean() / len(batches)).backward()
+        weights = [p for p in self.network.parameters() if p.grad is not None]
+        norm = torch.nn.utils.get_total_norm([p.grad for p in weights if p.grad is not None])
+        self._guard.check(self.step, batches, [values.detach() for values in losses], norm)
+        if limit := self.config.optimiser.gradient_clip:
+            torch.nn.utils.clip_grads_with_norm_(weights, limit, norm)
         rate = learning_rate(self.step, self.config.steps, self.config.optimiser)
         for group in self._optimiser.param_groups:
             group["lr"] = rate
         self._optimiser.step()
+        if self._average is not None:
+            self._average.update(self.step)
         self.step += 1
-        return {self.loss_key: float(loss.detach()), "learning_rate": rate, "gradient_norm": float(norm)}
+        loss = torch.stack([values.detach().mean() for values in losses]).mean()
+        return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm}
+
+    def _apart(self) -> object:
+        """Gradients stay on this rank until the last batch of a step."""
+        parallel = self._parallel
+        return parallel.no_sync() if isinstance(parallel, DistributedDataParallel) else nullcontext()
+
+    def settle(self) -> None:
+        """Wait for the device.
+
+        Raises:
+            TrainingError: As `take_step`.
+        """
+        self._guard.settle()
+
+    def over_ranks(self, values: dict[str, float | Tensor]) -> dict[str, float]:
+        """A step's values as numbers, the loss averaged over all ranks; call on every rank."""
+        loss = values[self.loss_key]
+        if self.world > 1 and isinstance(loss, Tensor):
+            torch.distributed.all_reduce(loss)
+            loss /= self.world
+        return {key: float(value) for key, value in values.items()}
 
     def validate(self) -> dict[str, float]:
-        """Errors on held-out pairs, before and after one update."""
-        return metrics.measure(self.network, self._held_out, self.objects, self.device)
+        """Errors on held-out pairs, before and after one update; on rank 0."""
+        return metrics.measure(self.kept, self._held_out, self.objects, self.device)
 
     def save(self, errors: dict[str, float] | None) -> None:
-        """Write `last`, and `best` when the errors are the best so far."""
+        """Write `last`, and `best` when the errors are the best so far.
+
+        What `last` needs beside it is written first and what the one before needed is dropped last: whenever this is
+        stopped, by a signal or a full disk, a whole checkpoint remains.
+
+        Raises:
+            StorageError: No space or no rights.
+            TrainingError: As `take_step`.
+        """
+        self.settle()
         provenance = checkpoint.Provenance(
             config=self.config, step=self.step, dataset_sha256=self._dataset_sha256, objects=self._objects_card,
             camera_fx_px=self._fx_px,
         )  # fmt: skip
         if errors is not None and errors["validation/add_after_mm"] < self.best_mm:
+            checkpoint.save(self.out / "best.safetensors", self.kept, provenance)
             self.best_mm = errors["validation/add_after_mm"]
-            checkpoint.save(self.out / "best.safetensors", self.network, provenance)
-        state = {"optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm}
+        state = {"optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm, "world": self.world}
+        if self._average is not None:
+            state["weights"] = self.network.state_dict()
         checkpoint.save_state(self.out, self.step, state)
-        checkpoint.save(self.out / "last.safetensors", self.network, provenance)
-        checkpoint.drop_states(self.out, self.step)
+        checkpoint.save(self.out / "last.safetensors", self.kept, provenance)
+        checkpoint.drop_leftovers(self.out, self.step)
 
     def close(self) -> None:
-        """Leave the process group.
+        """Let go of what the process group holds.
 
         The reducer goes first: were it the last owner of the group, its destructor would wait, with Python's lock
         held, for a thread that needs that lock.
         """
-        if self.world > 1:
-            self._parallel = self.network
-            gc.collect()
-            torch.distributed.destroy_process_group()
+        self._parallel = self._forward = self.network
+        gc.collect()
 
 
-def _optimiser(network: nn.Module, config: OptimiserConfig) -> torch.optim.Optimizer:
-    parameters = [p for p in network.parameters() if p.requires_grad]
-    if config.name == "adam":
-        return torch.optim.Adam(parameters, lr=config.lr, fused=True)
-    decayed = [p for p in parameters if p.ndim > 1]
-    plain = [p for p in parameters if p.ndim <= 1]
-    groups = [{"params": decayed, "weight_decay": config.weight_decay}, {"params": plain, "weight_decay": 0.0}]
-    return torch.optim.AdamW(groups, lr=config.lr, fused=True)
+def _dataset_sha256(reader: ShardReader, config: TrainConfig) -> str:
+    """Hash of the data card and the manifest; of the card alone where shards are still being added."""
+    if config.loader.follow:
+        return hashlib.sha256(json.dumps(reader.card, sort_keys=True).encode()).hexdigest()
+    return reader.digest
 
 
-def _not_finite(what: str, step: int, sample_ids: torch.Tensor) -> str:
-    names = ", ".join(f"shard {s} row {r}" for s, r in sample_ids[:8].tolist())
-    more = f" and {len(sample_ids) - 8} more" if len(sample_ids) > 8 else ""
-    return (
-        f"the {what} of step {step} is not finite, samples: {names}{more}; the weights were left alone. "
-        "Lower optimiser.lr, or set optimiser.gradient_clip"
-    )
+def _wait_for_shards(reader: ShardReader, wanted: int) -> None:
+    """Wait until a growing dataset has a shard for each loader process, or all it will ever have."""
+    told = False
+    while len(reader.committed) < min(wanted, n_shards(reader.card)):
+        if not told:
+            log.warning("%s: %d shards, waiting for %d", reader.url, len(reader.committed), wanted)
+            told = True
+        time.sleep(FOLLOW_POLL_S)
+        reader.refresh()

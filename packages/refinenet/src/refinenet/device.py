@@ -1,0 +1,19 @@
+"""Where a network runs."""
+
+import os
+
+import torch
+from posecore.errors import ConfigError
+
+
+def choose_device(name: str) -> torch.device:
+    """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
+
+    Raises:
+        ConfigError: A GPU is asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
