@@ -132,7 +132,7 @@ def test_descent_on_each_loss_finds_the_pose(mesh, shifted, name):
         chosen(update, shifted).sum().backward()
         optimiser.step()
         schedule.step()
-    found = geometry.apply_update(shifted.T_cam_obj_hypothesis, PoseUpdate(*(x.detach() for x in update)))
+    found = geometry.apply_update(shifted.T_cam_obj_hypothesis, PoseUpdate(update.dR.detach(), update.dt.detach()))
     before, after = (geometry.update_between(T, shifted.T_cam_obj) for T in (shifted.T_cam_obj_hypothesis, found))
     # Depth is left out: one direction of the contour loss can hide an error in it by turning the object.
     sideways = [u.dt[:, :2].norm(dim=-1).median() for u in (before, after)]

@@ -16,10 +16,12 @@ class PoseUpdate(NamedTuple):
     Attributes:
         dR: (b, 3, 3) rotations.
         dt: (b, 3) translations, metres.
+        confidence: (b,) logit of how well the hypothesis, before the update, fits; None from a network without it.
     """
 
     dR: Float[Tensor, "b 3 3"]
     dt: Float[Tensor, "b 3"]
+    confidence: Float[Tensor, " b"] | None = None
 
 
 def rotation_from_6d(x: Float[Tensor, "b 6"]) -> Float[Tensor, "b 3 3"]:
