@@ -95,7 +95,7 @@ def test_contour_loss_at_the_true_update_of_turned_pairs(turned):
 
 def test_rotating_about_the_camera_centre_would_not_vanish(shifted):
     """What the paper's Eq. 3 says when read literally; guards the choice of the object's origin."""
-    dR, dt = true_update(shifted)
+    dR, dt = true_update(shifted)[:2]
     t = shifted.T_cam_obj_hypothesis[:, :3, 3]
     about_camera = PoseUpdate(dR, dt + (dR @ t[..., None])[..., 0] - t)
     moved = about_camera.dt.norm(dim=-1) - dt.norm(dim=-1)
