@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from refinenet import checkpoint, metrics
 from refinenet.config import TrainConfig, load_config
-from refinenet.data import PairSource, Split, spread_rows, validation_batches
+from refinenet.data import PairSource, validation_batches
 from refinenet.device import choose_device
 from refinenet.loss import ObjectPoints
 from refinenet.objects import load_meshes, load_models, object_points

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 from posecore.shard import ShardReader
-from refinenet.data import split_by_scene
+from refinenet.split import split_by_scene
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 SMALL = [

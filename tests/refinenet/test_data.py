@@ -7,7 +7,8 @@ import torch
 from posecore.errors import ConfigError, ShardError
 from posecore.shard import ShardReader
 from refinenet.config import load_config
-from refinenet.data import PairStream, make_loader, split_by_scene, spread_rows
+from refinenet.data import PairStream, make_loader
+from refinenet.split import split_by_scene, spread_rows
 
 SMALL = [
     "batch=4",

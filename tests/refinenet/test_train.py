@@ -9,8 +9,9 @@ from refinenet.config import OptimiserConfig, load_config
 from refinenet.errors import TrainingError
 from refinenet.metrics import MetricLog
 from refinenet.network import PaperNet
+from refinenet.optimise import learning_rate
 from refinenet.train import train
-from refinenet.trainer import Trainer, learning_rate
+from refinenet.trainer import Trainer
 from safetensors.torch import load_file
 
 SMALL = [

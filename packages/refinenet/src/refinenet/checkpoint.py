@@ -1,7 +1,8 @@
 """Checkpoints: weights with the resolved config, step, seed, versions and dataset hash in one safetensors file.
 
-The optimiser's state lies beside it in a file named by its step, written first: a run killed between the two still
-finds the pair that belongs together.
+The weights are the ones to refine with: the running average, where the run keeps one. The optimiser's state, and the
+weights that training goes on with, lie beside it in a file named by its step, written first: a run killed between the
+two still finds the pair that belongs together.
 """
 
 import io
@@ -159,10 +160,13 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
         ) from error
 
 
-def drop_states(folder: Path, keep: int) -> None:
-    """Remove the optimiser states of other steps."""
+def drop_leftovers(folder: Path, keep: int) -> None:
+    """Remove the optimiser states of other steps, and what a killed run left under temporary names."""
     for path in folder.glob("optimiser-*.pt"):
         if path != _state_path(folder, keep):
+            path.unlink(missing_ok=True)
+    for name in ("*.safetensors", "optimiser-*.pt"):
+        for path in folder.glob(f".{name}.*.tmp"):
             path.unlink(missing_ok=True)
 
 
@@ -170,7 +174,10 @@ def _state_path(folder: Path, step: int) -> Path:
     return folder / f"optimiser-{step:07d}.pt"
 
 
-MAY_CHANGE = ("steps", "threads", "device", "log_every", "checkpoint_every", "validation.pairs", "validation.every")
+MAY_CHANGE = (
+    "steps", "threads", "device", "compile", "log_every", "checkpoint_every", "validation.pairs", "validation.every",
+    "loader.skip_bad_shards", "loader.prefetch", "loader.cache_mb",
+)  # fmt: skip
 """Settings that a resumed run may change: they decide how long and where it runs, not what a step does.
 
 The share of scenes held out is none of them: with another one, scenes that were trained on would be measured on.

@@ -182,6 +182,9 @@ class OptimiserConfig:
         schedule: `constant`, or `cosine` down to a hundredth of `lr` at the last step.
         warmup_steps: steps of linear rise.
         gradient_clip: largest gradient norm; 0 leaves it alone.
+        accumulate: batches whose gradients are averaged for one step.
+        ema_decay: of the running average of the weights, which is what is measured and kept; 0 keeps the weights
+            themselves. Early on, the average is over fewer steps: the decay of step n is at most (n + 1) / (n + 10).
     """
 
     name: Literal["adam", "adamw"] = "adam"
@@ -190,9 +193,13 @@ class OptimiserConfig:
     schedule: Literal["constant", "cosine"] = "constant"
     warmup_steps: int = 0
     gradient_clip: float = 0.0
+    accumulate: int = 1
+    ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
         _require(self.lr > 0, f"lr is {self.lr}, expected a positive number")
+        _require(self.accumulate >= 1, f"accumulate is {self.accumulate}, expected 1 or more")
+        _require(0 <= self.ema_decay < 1, f"ema_decay is {self.ema_decay}, expected 0 to under 1")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,12 +211,16 @@ class LoaderConfig:
         shuffle_shards: shards whose samples are shuffled together.
         prefetch: batches each worker prepares ahead.
         cache_mb: decoded shards each worker keeps for the next epoch; 0 keeps none.
+        follow: the dataset is still growing: wait for its first shards, and take in new ones between epochs.
+        skip_bad_shards: train on without shards that cannot be read, instead of stopping at the first.
     """
 
     workers: int = 1
     shuffle_shards: int = 4
     prefetch: int = 4
     cache_mb: int = 0
+    follow: bool = False
+    skip_bad_shards: bool = False
 
     def __post_init__(self) -> None:
         _require(self.workers >= 0, f"workers is {self.workers}, expected 0 or more")
@@ -250,13 +261,14 @@ class TrainConfig:
         optimiser: optimiser.
         loader: loader.
         validation: held-out measurement.
-        batch: pairs in a step, on each rank.
+        batch: pairs in a batch, on each rank; a step takes `optimiser.accumulate` of them.
         steps: steps of the run; the cosine schedule ends there.
         seed: of weights, order, hypotheses and augmentation.
         threads: torch threads; 0 leaves torch's own choice.
         precision: of the convolutions in training; `auto` is bfloat16 on GPUs and on processors that compute in it,
             float32 elsewhere. Poses, losses and weights are float32 always.
         device: `cpu`, `cuda`, or `auto` for a GPU where there is one.
+        compile: let torch.compile fuse the network; the first step takes longer. Needs a C++ compiler.
         log_every: steps between lines of metrics.
         checkpoint_every: steps between checkpoints.
     """
@@ -276,6 +288,7 @@ class TrainConfig:
     threads: int = 0
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
+    compile: bool = False
     log_every: int = 20
     checkpoint_every: int = 500
 

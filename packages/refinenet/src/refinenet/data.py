@@ -25,80 +25,35 @@ from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
 from refinenet.objects import load_meshes
+from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
 
 Array = np.ndarray
 RECUT_FIELDS = (
     "scene_rgb", "scene_mask", "scene_contour_cam_m", "T_cam_obj", "T_cam_obj_hypothesis", "K", "window_px", "obj_id",
 )  # fmt: skip
-ORDER, SHUFFLE, SAMPLE, SPLIT = range(4)
-"""First key of each random stream, so that no two streams of a run share draws."""
 
 
 class Batch(NamedTuple):
-    """What a step consumes; `sample_ids` holds shard and row of every pair."""
+    """What a step consumes.
+
+    Attributes:
+        pair: What the network sees.
+        target: What the loss compares its update with.
+        sample_ids: (b, 2) shard and row of every pair.
+        skipped: What is wrong with shards that others stand in for, each told once by the process that met it.
+    """
 
     pair: Pair
     target: Target
     sample_ids: Int[Tensor, "b 2"]
+    skipped: tuple[str, ...] = ()
 
     def to(self, device: torch.device) -> "Batch":
-        """The same on another device."""
-        pair, target = Pair(*(x.to(device) for x in self.pair)), Target(*(x.to(device) for x in self.target))
-        return Batch(pair, target, self.sample_ids)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Split:
-    """Rows of every shard that belong to one side of the split by scene.
-
-    Attributes:
-        rows: row numbers by shard; shards without a row are left out.
-        scenes: how many scenes.
-    """
-
-    rows: dict[int, Array]
-    scenes: int
-
-    @property
-    def n(self) -> int:
-        """Number of samples."""
-        return sum(len(rows) for rows in self.rows.values())
-
-
-def split_by_scene(reader: ShardReader, validation_share: float, seed: int) -> tuple[Split, Split]:
-    """Divide a dataset's samples into training and validation by scene, never by sample.
-
-    Args:
-        reader: The dataset.
-        validation_share: Share of scenes held out, at least one.
-        seed: Of the choice.
-
-    Raises:
-        ShardError: No shard is there, or fewer than two scenes.
-    """
-    if not reader.committed:
-        raise ShardError(f"{reader.url}: no finished shard; let `synthgen render` write one first")
-    scene_of = {shard: reader.read(shard, ["scene_index"])["scene_index"] for shard in reader.committed}
-    scenes = np.unique(np.concatenate(list(scene_of.values())))
-    if len(scenes) < 2:
-        raise ShardError(f"{reader.url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
-    held = max(1, min(len(scenes) - 1, round(validation_share * len(scenes))))
-    validation = np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held]
-
-    def side(inside: bool, count: int) -> Split:
-        rows = {s: np.flatnonzero(np.isin(index, validation) == inside) for s, index in scene_of.items()}
-        return Split(rows={s: r for s, r in rows.items() if len(r)}, scenes=count)
-
-    return side(False, len(scenes) - held), side(True, held)
-
-
-def spread_rows(split: Split, count: int) -> Split:
-    """At most `count` rows, spread evenly over the split."""
-    keys = [(shard, row) for shard, rows in sorted(split.rows.items()) for row in rows]
-    chosen = [keys[i] for i in np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).astype(int))]
-    by_shard = itertools.groupby(chosen, key=lambda key: key[0])
-    return Split(rows={shard: np.array([row for _, row in rows]) for shard, rows in by_shard}, scenes=split.scenes)
+        """The same on another device; copies from pinned memory are only queued."""
+        pair = Pair(*(x.to(device, non_blocking=True) for x in self.pair))
+        target = Target(*(x.to(device, non_blocking=True) for x in self.target))
+        return self._replace(pair=pair, target=target)
 
 
 class PairSource:
@@ -110,6 +65,8 @@ class PairSource:
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()
         self._cache: dict[int, dict[str, Array]] = {}
+        self._bad: dict[int, str] = {}
+        self._untold: list[str] = []
         self._rasteriser: Rasteriser | None = None
         if config.window.kind == "diameter":
             meshes = load_meshes(self.reader)
@@ -130,9 +87,26 @@ class PairSource:
             self._rasteriser.close()
 
     def load(self, shards: Sequence[int]) -> dict[int, dict[str, Array]]:
-        """Read whole shards, only the fields that are used."""
+        """Read whole shards, only the fields that are used.
+
+        One that cannot be read is left out under `loader.skip_bad_shards`, and told with the next batch.
+
+        Raises:
+            ShardError: One cannot be read, without that setting.
+        """
         fields = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
-        read = {shard: self._cache.get(shard) or self.reader.read(shard, fields) for shard in shards}
+        if set(shards) - {*self.reader.committed}:
+            self.reader.refresh()
+        read: dict[int, dict[str, Array]] = {}
+        for shard in shards:
+            try:
+                read[shard] = self._cache.get(shard) or self.reader.read(shard, fields)
+            except ShardError as error:
+                if not self._config.loader.skip_bad_shards:
+                    raise
+                if shard not in self._bad:
+                    self._bad[shard] = str(error)
+                    self._untold.append(str(error))
         room = self._config.loader.cache_mb * 2**20 - sum(map(_bytes, self._cache.values()))
         for shard, arrays in read.items():
             # What is in stays in: replacing the oldest would miss every time when an epoch does not fit.
@@ -155,7 +129,9 @@ class PairSource:
             arrays = self._make(samples, rngs)
         if arrays is None:
             return None
-        return _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
+        batch = _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
+        told, self._untold = tuple(self._untold), []
+        return batch._replace(skipped=told)
 
 
 def _bytes(arrays: dict[str, Array]) -> int:
@@ -201,6 +177,7 @@ class PairStream(IterableDataset[Batch]):
         world: Number of training processes.
         workers: Number of loader streams of each rank, at least 1.
         start: Batches of this rank that were consumed before.
+        growth: Adds shards of a growing dataset between epochs.
     """
 
     url: str
@@ -210,6 +187,7 @@ class PairStream(IterableDataset[Batch]):
     world: int = 1
     workers: int = 1
     start: int = 0
+    growth: Growth | None = None
 
     def __post_init__(self) -> None:
         slots = self.world * self.workers
@@ -219,14 +197,23 @@ class PairStream(IterableDataset[Batch]):
                 f"expected one each; lower loader.workers, or render with a smaller shard size"
             )
 
+    def _epochs(self) -> Iterator[tuple[int, dict[int, Array]]]:
+        """Number and rows by shard of every epoch."""
+        rows = dict(self.split.rows)
+        growth = iter(()) if self.growth is None else self.growth.epochs(self.url)
+        for epoch in itertools.count():
+            if epoch > 0:
+                rows |= next(growth, {})
+            yield epoch, rows
+
     def groups(self, slot: int) -> Iterator[list[tuple[int, int, int]]]:
         """Shuffled groups of (epoch, shard, row) of one of `world * workers` slots, without end."""
         seed, size = self.config.seed, self.config.loader.shuffle_shards
-        for epoch in itertools.count():
-            order = np.random.default_rng([seed, ORDER, epoch]).permutation(sorted(self.split.rows))
+        for epoch, rows in self._epochs():
+            order = np.random.default_rng([seed, ORDER, epoch]).permutation(sorted(rows))
             mine = order[slot :: self.world * self.workers]
             for first in range(0, len(mine), size):
-                keys = [(epoch, int(s), int(r)) for s in mine[first : first + size] for r in self.split.rows[int(s)]]
+                keys = [(epoch, int(s), int(r)) for s in mine[first : first + size] for r in rows[int(s)]]
                 shuffle = np.random.default_rng([seed, SHUFFLE, epoch, slot, first]).permutation(len(keys))
                 yield [keys[i] for i in shuffle]
 
@@ -250,8 +237,8 @@ class PairStream(IterableDataset[Batch]):
             if skip >= len(group):
                 skip -= len(group)
                 continue
-            group, skip = group[skip:], 0
             arrays = source.load(sorted({shard for _, shard, _ in group}))
+            group, skip = self._with_stand_ins(source, group, arrays)[skip:], 0
             for epoch, shard, row in group:
                 keys.append((epoch, shard, row))
                 samples.append({name: values[row] for name, values in arrays[shard].items()})
@@ -261,6 +248,30 @@ class PairStream(IterableDataset[Batch]):
                     if batch is None:
                         raise ShardError(f"{self.url}: no object can be seen in any of {self.config.batch} samples")
                     yield batch
+
+    def _with_stand_ins(
+        self, source: PairSource, group: list[tuple[int, int, int]], arrays: dict[int, dict[str, Array]]
+    ) -> list[tuple[int, int, int]]:
+        """The group, with samples of the other shards in place of those of shards that could not be read.
+
+        Left out they would move every later batch, and a resumed run could not tell by arithmetic where it was.
+        """
+        if all(shard in arrays for _, shard, _ in group):
+            return group
+        pool = [key for key in group if key[1] in arrays]
+        others = iter(sorted(self.split.rows))
+        while not pool:
+            shard = next(others, None)
+            if shard is None:
+                raise ShardError(f"{self.url}: none of its shards can be read; render the dataset again")
+            arrays |= source.load([shard])
+            pool = [(group[0][0], shard, int(row)) for row in self.split.rows[shard] if shard in arrays]
+        return [
+            key
+            if key[1] in arrays
+            else pool[np.random.default_rng([self.config.seed, STAND_IN, *key]).integers(len(pool))]
+            for key in group
+        ]
 
 
 def prepare_worker(threads: int = 1) -> None:
@@ -285,14 +296,20 @@ class _Loader(DataLoader[Batch]):
             raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None
 
 
-def make_loader(stream: PairStream) -> DataLoader[Batch]:
-    """A loader of the stream's batches; processes are spawned, since a GL context does not survive a fork."""
+def make_loader(stream: PairStream, *, pin: bool = False) -> DataLoader[Batch]:
+    """A loader of the stream's batches; processes are spawned, since a GL context does not survive a fork.
+
+    Args:
+        stream: What to load.
+        pin: Put batches into page-locked memory, from where a GPU copies them while it computes.
+    """
     loader = stream.config.loader
     if loader.workers == 0:
-        return _Loader(stream, batch_size=None)
+        return _Loader(stream, batch_size=None, pin_memory=pin)
     return _Loader(
         stream,
         batch_size=None,
+        pin_memory=pin,
         num_workers=stream.workers,
         prefetch_factor=loader.prefetch,
         multiprocessing_context="spawn",
@@ -300,10 +317,28 @@ def make_loader(stream: PairStream) -> DataLoader[Batch]:
     )
 
 
+def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]:
+    """Batches on a device; to a GPU they are copied beside the step before, which is still being computed."""
+    if device.type != "cuda":
+        yield from (batch.to(device) for batch in batches)
+        return
+    side = torch.cuda.Stream(device)
+    for batch in batches:
+        with torch.cuda.stream(side):
+            there = batch.to(device)
+        main = torch.cuda.current_stream(device)
+        main.wait_stream(side)
+        for tensor in (*there.pair, *there.target):
+            tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
+        yield there
+
+
 def validation_batches(source: PairSource, split: Split, batch: int) -> Iterator[Batch]:
     """Batches of a split in the order of its rows, the same at every call."""
     for shard, rows in sorted(split.rows.items()):
-        arrays = source.load([shard])[shard]
+        arrays = source.load([shard]).get(shard)
+        if arrays is None:
+            continue
         for first in range(0, len(rows), batch):
             chosen = rows[first : first + batch]
             samples = [{name: values[row] for name, values in arrays.items()} for row in chosen]

@@ -8,8 +8,9 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import torch
 from posecore.errors import CheckpointError, ConfigError, ShardError
@@ -20,8 +21,10 @@ from torch.nn.parallel import DistributedDataParallel
 from refinenet import backbone, checkpoint, metrics
 from refinenet.config import TrainConfig
 from refinenet.data import Batch, PairSource, PairStream, make_loader, on_device, validation_batches
+from refinenet.device import choose_device
+from refinenet.geometry import PoseUpdate
 from refinenet.loss import make_loss
-from refinenet.network import PaperNet, make_network
+from refinenet.network import Pair, PaperNet, make_network
 from refinenet.objects import load_meshes, load_models, object_points
 from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows
@@ -30,19 +33,6 @@ log = logging.getLogger(__name__)
 
 FOLLOW_POLL_S = 2.0
 """Time between looks at a growing dataset that has too few shards to begin with."""
-
-
-def choose_device(name: str) -> torch.device:
-    """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
-
-    Raises:
-        ConfigError: A GPU is asked for and there is none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
-    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
 
 
 def use_bfloat16(precision: str, device: torch.device) -> bool:
@@ -135,28 +125,24 @@ class Trainer:
 
     def _split(self, reader: ShardReader, *, resume: bool) -> tuple[Split, Split, DataRecord]:
         """Both sides of the split, the same on every rank: rank 0 decides, or reads what the run began with."""
-        settings, skip = self.config.loader, self.config.loader.skip_bad_shards
-        shared: list[DataRecord | None] = [None]
+        shared: list[Any] = [None]
         if self.rank == 0:
-            if resume:
-                shared = [DataRecord.load(self.out)]
-            else:
-                if settings.follow:
-                    _wait_for_shards(reader, self.world * max(1, settings.workers))
-                scene_of, _ = read_scenes(reader, reader.committed, skip=skip)
+            settings = self.config.loader
+            if settings.follow and not resume:
+                _wait_for_shards(reader, self.world * max(1, settings.workers))
+            record = DataRecord.load(self.out) if resume else None
+            begun = record.shards if record is not None else reader.committed
+            scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards)
+            self._tell_skipped(*bad.values())
+            if record is None:
                 held = held_out_scenes(reader.url, scene_of, self.config.validation.scene_share, self.config.seed)
                 record = DataRecord(shards=tuple(scene_of), held_out=tuple(int(scene) for scene in held))
                 record.save(self.out)
-                shared = [record]
+            shared = [(record, scene_of)]
         if self.world > 1:
             torch.distributed.broadcast_object_list(shared, src=0)
-        (record,) = shared
-        assert record is not None
-        reader.refresh()
-        begun = reader.committed if not settings.follow else record.shards
-        scene_of, bad = read_scenes(reader, begun, skip=skip)
-        self._tell_skipped(*bad.values())
-        return (*divide({s: scene_of[s] for s in record.shards if s in scene_of}, record.held_out), record)
+        record, scene_of = shared[0]
+        return (*divide(scene_of, record.held_out), record)
 
     def _make_held_out(self) -> list[Batch]:
         """Held-out pairs, made once and kept: the same are measured every time, without a GL context in this process.
@@ -198,6 +184,8 @@ class Trainer:
             self._average.network.load_state_dict(last.tensors)
         self._optimiser.load_state_dict(state["optimiser"])
         self.step, self.best_mm = last.provenance.step, float(state["best_mm"])
+        if self.rank == 0:
+            checkpoint.drop_leftovers(self.out, self.step)
 
     def _distribute(self) -> nn.Module:
         if self.world == 1:
@@ -233,7 +221,7 @@ class Trainer:
             batch = batch.to(self.device)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-                    update = self._forward(batch.pair)
+                    update = self._predict(batch.pair)
                 losses.append(self._loss(update, batch.target))
                 (losses[-1].mean() / len(batches)).backward()
         weights = [p for p in self.network.parameters() if p.grad is not None]
@@ -251,13 +239,24 @@ class Trainer:
         loss = torch.stack([values.detach().mean() for values in losses]).mean()
         return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm}
 
-    def _apart(self) -> object:
+    def _predict(self, pair: Pair) -> PoseUpdate:
+        if not self.config.compile:
+            return self._forward(pair)
+        try:
+            return self._forward(pair)
+        except torch._dynamo.exc.TorchDynamoException as error:
+            detail = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise ConfigError(
+                f"compile: torch.compile failed here ({detail}); train with --set compile=false"
+            ) from error
+
+    def _apart(self) -> AbstractContextManager[None]:
         """Gradients stay on this rank until the last batch of a step."""
         parallel = self._parallel
         return parallel.no_sync() if isinstance(parallel, DistributedDataParallel) else nullcontext()
 
     def settle(self) -> None:
-        """Wait for the device.
+        """Wait for the device to tell whether the last step's numbers were finite.
 
         Raises:
             TrainingError: As `take_step`.
@@ -265,7 +264,12 @@ class Trainer:
         self._guard.settle()
 
     def over_ranks(self, values: dict[str, float | Tensor]) -> dict[str, float]:
-        """A step's values as numbers, the loss averaged over all ranks; call on every rank."""
+        """A step's values as numbers, the loss averaged over all ranks; call on every rank.
+
+        Raises:
+            TrainingError: As `take_step`.
+        """
+        self.settle()
         loss = values[self.loss_key]
         if self.world > 1 and isinstance(loss, Tensor):
             torch.distributed.all_reduce(loss)

@@ -42,6 +42,8 @@ log = logging.getLogger(__name__)
 )
 @click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
 @click.option("--resume", is_flag=True, help="Go on with the run in --out.")
+@click.option("--follow", is_flag=True, help="SHARDS is still being rendered: take new shards in between epochs.")
+@click.option("--skip-bad-shards", is_flag=True, help="Train without shards that cannot be read; each is named.")
 @quiet_option
 @verbose_option
 def train(
@@ -52,6 +54,8 @@ def train(
     backbone_weights: Path | None,
     out: Path | None,
     resume: bool,
+    follow: bool,
+    skip_bad_shards: bool,
     quiet: bool,
     verbose: bool,
     steps: int | None,
@@ -71,6 +75,7 @@ def train(
     refinenet train shards/ --preset paper --backbone-weights inception_v4.safetensors --out runs/benchvise
     refinenet train shards/ --set hypothesis.max_angle_deg=40 --set optimiser.lr=3e-4
     refinenet train shards/ --out runs/benchvise --resume
+    refinenet train shards/ --follow --set optimiser.ema_decay=0.999 --set optimiser.accumulate=4
     torchrun --nproc-per-node 4 -m refinenet train s3://bucket/shards --preset paper
     """
     start_logging(verbose)
@@ -79,7 +84,7 @@ def train(
 
     named = {
         "steps": steps, "batch": batch, "loss.name": loss, "seed": seed, "loader.workers": workers, "threads": threads,
-        "device": device,
+        "device": device, "loader.follow": follow or None, "loader.skip_bad_shards": skip_bad_shards or None,
         # quoted: a path may hold what YAML reads as a comment
         "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
     }  # fmt: skip
@@ -88,9 +93,10 @@ def train(
     folder = out or Path("runs") / preset
     with stoppable(folder), _quiet_threads(), _training_bar(config.steps, quiet) as report:
         errors = run(config, shards, folder, resume=resume, report=report)
-    for line in _comparison(errors):
-        click.echo(line)
-    click.echo(f"{folder / 'best.safetensors'}")
+    if errors:  # under torchrun, rank 0 has them
+        for line in _comparison(errors):
+            click.echo(line)
+        click.echo(f"{folder / 'best.safetensors'}")
 
 
 def _comparison(errors: dict[str, float]) -> Iterator[str]:
@@ -123,8 +129,10 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
                 bar.console.print(f"step {step}  {move}", highlight=False, soft_wrap=True)
             return
         loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss_"))
-        timing = f"data wait {values['data_wait_ms']:.0f} ms, compute {values['compute_ms']:.0f} ms"
-        bar.update(task, completed=step, state=f"{loss}  {timing}")
+        wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_share']:.0f} %)"
+        timing = f"{wait}, compute {values['compute_ms']:.0f} ms, {values['pairs_per_s']:.0f} pairs/s"
+        bad = f"  {values['skipped_shards']:.0f} bad shards" if values["skipped_shards"] else ""
+        bar.update(task, completed=step, state=f"{loss}  {timing}{bad}")
 
     try:
         yield report

@@ -1,0 +1,210 @@
+"""Which samples are trained on and which are held out: by scene, also while a dataset is still growing.
+
+A run fixes at its start which scenes are held out and which shards it begins with, in `data.json`. A run that follows a
+growing dataset adds one small file an epoch, written by whichever process comes there first and read by all: so ranks,
+loader processes and resumed runs agree on what an epoch holds.
+"""
+
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from posecore.errors import CheckpointError, ShardError
+from posecore.files import storage_error, write_atomic
+from posecore.shard import ShardReader, n_shards
+
+Array = np.ndarray
+ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN = range(5)
+"""First key of each random stream, so that no two streams of a run share draws."""
+
+RECORD, GROWTH = "data.json", "growth"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Split:
+    """Rows of every shard that belong to one side of the split by scene.
+
+    Attributes:
+        rows: row numbers by shard; shards without a row are left out.
+        scenes: how many scenes.
+    """
+
+    rows: dict[int, Array]
+    scenes: int
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return sum(len(rows) for rows in self.rows.values())
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataRecord:
+    """What a run fixed about its data when it started.
+
+    Attributes:
+        shards: shards that were there.
+        held_out: scenes that are measured on and never trained on.
+    """
+
+    shards: tuple[int, ...]
+    held_out: tuple[int, ...]
+
+    def save(self, out: Path) -> None:
+        """Write it into a run's folder, and drop what an earlier run left of a growing dataset.
+
+        Raises:
+            StorageError: No rights or no space.
+        """
+        shutil.rmtree(out / GROWTH, ignore_errors=True)
+        text = json.dumps({"shards": self.shards, "held_out_scenes": self.held_out})
+        write_atomic(out / RECORD, text.encode())
+
+    @classmethod
+    def load(cls, out: Path) -> "DataRecord":
+        """Read it from a run's folder.
+
+        Raises:
+            CheckpointError: It is missing or damaged.
+        """
+        try:
+            found = json.loads((out / RECORD).read_text())
+            return cls(shards=tuple(found["shards"]), held_out=tuple(found["held_out_scenes"]))
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CheckpointError(
+                f"{out / RECORD}: missing or damaged ({type(error).__name__}), so nobody knows which scenes this run "
+                "held out; start a new run in another --out"
+            ) from error
+
+
+def read_scenes(
+    reader: ShardReader, shards: Sequence[int], *, skip: bool = False
+) -> tuple[dict[int, Array], dict[int, str]]:
+    """Scene of every sample by shard, and what is wrong with the shards that cannot be read.
+
+    Args:
+        reader: The dataset.
+        shards: Which shards.
+        skip: Whether to go on without shards that cannot be read.
+
+    Raises:
+        ShardError: One cannot be read and `skip` is off.
+    """
+    scenes, bad = {}, {}
+    for shard in shards:
+        try:
+            scenes[shard] = reader.read(shard, ["scene_index"])["scene_index"]
+        except ShardError as error:
+            if not skip:
+                raise
+            bad[shard] = str(error)
+    return scenes, bad
+
+
+def held_out_scenes(url: str, scene_of: Mapping[int, Array], share: float, seed: int) -> Array:
+    """Scenes to hold out, at least one, drawn from the seed.
+
+    Raises:
+        ShardError: No shard is there, or fewer than two scenes.
+    """
+    if not scene_of:
+        raise ShardError(f"{url}: no finished shard; let `synthgen render` write one first, or wait with --follow")
+    scenes = np.unique(np.concatenate(list(scene_of.values())))
+    if len(scenes) < 2:
+        raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
+    held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
+    return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held])
+
+
+def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tuple[Split, Split]:
+    """Samples for training and for validation."""
+    scenes = np.unique(np.concatenate(list(scene_of.values())))
+    held = np.isin(scenes, held_out)
+
+    def side(inside: bool) -> Split:
+        rows = {s: np.flatnonzero(np.isin(index, held_out) == inside) for s, index in scene_of.items()}
+        return Split(rows={s: r for s, r in rows.items() if len(r)}, scenes=int((held == inside).sum()))
+
+    return side(False), side(True)
+
+
+def split_by_scene(reader: ShardReader, validation_share: float, seed: int) -> tuple[Split, Split]:
+    """Divide a dataset's samples into training and validation by scene, never by sample.
+
+    Args:
+        reader: The dataset.
+        validation_share: Share of scenes held out, at least one.
+        seed: Of the choice.
+
+    Raises:
+        ShardError: No shard is there, one cannot be read, or there are fewer than two scenes.
+    """
+    scene_of, _ = read_scenes(reader, reader.committed)
+    return divide(scene_of, held_out_scenes(reader.url, scene_of, validation_share, seed))
+
+
+def spread_rows(split: Split, count: int) -> Split:
+    """At most `count` rows, spread evenly over the split."""
+    keys = [(shard, row) for shard, rows in sorted(split.rows.items()) for row in rows]
+    chosen = [keys[i] for i in np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).astype(int))]
+    by_shard = itertools.groupby(chosen, key=lambda key: key[0])
+    return Split(rows={shard: np.array([row for _, row in rows]) for shard, rows in by_shard}, scenes=split.scenes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Growth:
+    """Takes new shards of a growing dataset into training, an epoch at a time.
+
+    Attributes:
+        out: Folder of the run, the same for all its processes.
+        record: What the run began with.
+        skip_bad_shards: Whether a new shard that cannot be read is left for a later epoch, or an error.
+    """
+
+    out: Path
+    record: DataRecord
+    skip_bad_shards: bool = False
+
+    def epochs(self, url: str) -> Iterator[dict[int, Array]]:
+        """Training rows by shard that join at each epoch from epoch 1 on, until the dataset is complete.
+
+        Raises:
+            ShardError: A new shard cannot be read, or is gone from the manifest.
+            StorageError: The file of an epoch cannot be written.
+        """
+        reader = ShardReader(url)
+        known = set(self.record.shards)
+        for epoch in itertools.count(1):
+            path = self.out / GROWTH / f"epoch-{epoch:06d}.json"
+            if not path.exists():
+                reader.refresh()
+                new, _ = read_scenes(reader, sorted({*reader.committed} - known), skip=self.skip_bad_shards)
+                complete = len(known | set(new)) == n_shards(reader.card)
+                _write_once(path, {"shards": sorted(new), "complete": complete})
+            found = json.loads(path.read_text())
+            if set(found["shards"]) - {*reader.committed}:
+                reader.refresh()
+            scene_of, _ = read_scenes(reader, found["shards"], skip=self.skip_bad_shards)
+            known |= set(scene_of)
+            yield {s: np.flatnonzero(~np.isin(index, self.record.held_out)) for s, index in scene_of.items()}
+            if found["complete"]:
+                return
+
+
+def _write_once(path: Path, content: Mapping[str, object]) -> None:
+    """Write a JSON file whole, unless another process has done so."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    write_atomic(temporary, json.dumps(content).encode())
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise storage_error(path, error) from error
+    finally:
+        temporary.unlink(missing_ok=True)
