@@ -45,7 +45,7 @@ lint: $(SETUP) ## Formatting and lint, without changing anything
 
 types: $(SETUP) ## Static types
 	$(BIN)/mypy
-	$(BIN)/mypy benchmarks examples
+	$(BIN)/mypy benchmarks examples experiments
 
 check: lint types test docs ## What has to pass before a change goes in: lint, types, tests, documentation
 

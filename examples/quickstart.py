@@ -9,18 +9,16 @@ script can be stopped and started at will. At the end it checks that the network
 import argparse
 import json
 import os
-import shlex
-import shutil
-import subprocess
 import sys
-import time
 import webbrowser
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from experiments.chain import ROOT, Step, quoted, run_all, say, shown, words
+
 OBJECT = ROOT / "examples" / "objects" / "tug.ply"
 SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
 
@@ -55,25 +53,6 @@ SMOKE = Size(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step:
-    """One command.
-
-    Attributes:
-        name: Short and unique; the note of how far it came is kept under it.
-        why: One line for the reader.
-        command: Program and arguments.
-        leaves: What it leaves in the working folder; without it the step is not complete, whatever the note says.
-        inside: Whether it runs in the working folder instead of beside it.
-    """
-
-    name: str
-    why: str
-    command: tuple[str, ...]
-    leaves: str
-    inside: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
 class Promise:
     """One line of what the quick start promises, as found in the report."""
 
@@ -102,6 +81,7 @@ def steps(work: Path, size: Size) -> Iterator[Step]:
         why="A small refinement network.",
         command=words(f"refinenet train {folder}/shards --preset compact {size.train} --out {folder}/run"),
         leaves="run/best.safetensors",
+        run="run",
     )
     yield Step(
         name="start-poses",
@@ -135,96 +115,6 @@ def steps(work: Path, size: Size) -> Iterator[Step]:
     )
 
 
-def words(line: str) -> tuple[str, ...]:
-    """Split a command line as a shell would."""
-    return tuple(shlex.split(line))
-
-
-def quoted(path: Path) -> str:
-    """Path as the user would type it."""
-    return shlex.quote(shown(path))
-
-
-def shown(path: Path) -> str:
-    """Path as the user would type it: relative to where the script was started, if it lies below."""
-    here = Path.cwd()
-    return str(path.relative_to(here) if path.is_relative_to(here) else path)
-
-
-def executable(program: str) -> str:
-    """Find a program of the project, first beside the Python that runs this."""
-    beside = Path(sys.executable).with_name(program)
-    found = str(beside) if beside.is_file() else shutil.which(program)
-    if found is None:
-        raise SystemExit(
-            f"Error: the command {program} is not installed here; run `make setup`, then `make quickstart`"
-        )
-    return found
-
-
-def run_all(work: Path, size: Size) -> None:
-    """Run the steps that are not complete; a step that ran makes all later ones run again."""
-    everything = list(steps(work, size))
-    marks = [work / ".steps" / f"{step.name}.json" for step in everything]
-    complete = [
-        marked(mark, step, "complete") and (work / step.leaves).exists()
-        for mark, step in zip(marks, everything, strict=True)
-    ]
-    todo = [*complete, False].index(False)
-    for step in everything[:todo]:
-        say(f"{step.why} Done already.")
-    began_all = time.monotonic()
-    for number, step in enumerate(everything[todo:], start=todo):
-        interrupted = number == todo and marked(marks[number], step, "started")
-        for mark in marks[number:]:
-            mark.unlink(missing_ok=True)
-        write_mark(marks[number], step, "started")
-        say(f"\n[{number + 1}/{len(everything)}] {step.why}")
-        began = time.monotonic()
-        run_step(step, work, interrupted)
-        took_s = time.monotonic() - began
-        write_mark(marks[number], step, "complete", seconds=round(took_s, 1))
-        say(f"  {took_s:.0f} s")
-    if todo < len(everything):
-        say(f"\nTogether: {(time.monotonic() - began_all) / 60:.1f} min")
-
-
-def run_step(step: Step, work: Path, interrupted: bool) -> None:
-    """Run one command, shown as it would be typed.
-
-    Args:
-        step: What to run.
-        work: Working folder.
-        interrupted: Whether this very command was started before and not completed. Training has to be told so; the
-            other commands see it for themselves.
-    """
-    arguments = step.command[1:]
-    if step.name == "train":
-        if interrupted and (work / "run" / "last.safetensors").is_file():
-            arguments = (*arguments, "--resume")
-        else:
-            shutil.rmtree(work / "run", ignore_errors=True)
-    program = step.command[0]
-    say(f"  $ {f'cd {shown(work)} && ' if step.inside else ''}{shlex.join((program, *arguments))}")
-    code = subprocess.run([executable(program), *arguments], cwd=work if step.inside else None).returncode
-    if code:
-        raise SystemExit(f"Error: {program} {arguments[0]} ended with exit code {code}; the reason stands above")
-
-
-def marked(mark: Path, step: Step, state: str) -> bool:
-    """Tell whether this very command was left in this state."""
-    if not mark.is_file():
-        return False
-    found = json.loads(mark.read_text(encoding="utf-8"))
-    return bool(found["command"] == list(step.command) and found["state"] == state)
-
-
-def write_mark(mark: Path, step: Step, state: str, **values: float) -> None:
-    """Leave a note of how far a step came."""
-    mark.parent.mkdir(parents=True, exist_ok=True)
-    mark.write_text(json.dumps({"state": state, "command": step.command, **values}), encoding="utf-8")
-
-
 def promises(summary: dict[str, Any]) -> list[Promise]:
     """Compare the poses of the network just trained with the start poses, by the report's numbers."""
     quick = next(entry for entry in summary["against_start"] if entry["name"] == "quick")
@@ -252,11 +142,6 @@ def show(page: Path) -> None:
         webbrowser.open(page.resolve().as_uri())
 
 
-def say(text: str) -> None:
-    """Write a line at once, so that it stands before the output of the command it announces."""
-    print(text, flush=True)
-
-
 def main() -> int:
     """Run the quick start; return 1 where the promised improvement is missing."""
     parser = argparse.ArgumentParser(description="From a mesh to a report, in one go.")
@@ -266,7 +151,7 @@ def main() -> int:
     work, size = arguments.work.resolve(), SMOKE if arguments.smoke else FULL
     say(f"Working in {shown(work)}; {size.minutes} on two CPU cores. Stop with Ctrl-C, start again to go on.")
     try:
-        run_all(work, size)
+        run_all(work, list(steps(work, size)))
     except KeyboardInterrupt:
         raise SystemExit("\nStopped. The same command goes on from here.") from None
     kept = True

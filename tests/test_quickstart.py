@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from experiments import chain
+
 SCRIPT = Path(__file__).resolve().parent.parent / "examples" / "quickstart.py"
 
 
@@ -61,30 +64,29 @@ def recorder(ran: list) -> Callable:
 
 
 def test_a_step_that_changed_makes_the_later_ones_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, ran = quickstart(), []
-    monkeypatch.setattr(module, "run_step", recorder(ran))
-    module.run_all(tmp_path, module.SMOKE)
-    everything = [step.name for step in module.steps(tmp_path, module.SMOKE)]
-    assert ran == [(name, False) for name in everything]
+    everything, ran = list(quickstart().steps(tmp_path, quickstart().SMOKE)), []
+    names = [step.name for step in everything]
+    monkeypatch.setattr(chain, "run_step", recorder(ran))
+    chain.run_all(tmp_path, everything)
+    assert ran == [(name, False) for name in names]
 
     ran.clear()
-    module.run_all(tmp_path, module.SMOKE)
+    chain.run_all(tmp_path, everything)
     assert ran == []
 
     mark = tmp_path / ".steps" / "train.json"
     mark.write_text(json.dumps(json.loads(mark.read_text()) | {"command": ["refinenet", "train", "otherwise"]}))
-    module.run_all(tmp_path, module.SMOKE)
-    assert ran == [(name, False) for name in everything[everything.index("train") :]]
+    chain.run_all(tmp_path, everything)
+    assert ran == [(name, False) for name in names[names.index("train") :]]
 
     ran.clear()
     (tmp_path / "report" / "summary.json").unlink()
-    module.run_all(tmp_path, module.SMOKE)
+    chain.run_all(tmp_path, everything)
     assert ran == [("report", False)]
 
 
 def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, ran = quickstart(), []
-
+    everything, ran = list(quickstart().steps(tmp_path, quickstart().SMOKE)), []
     record = recorder(ran)
 
     def stop_in_training(step, work, interrupted):
@@ -92,11 +94,11 @@ def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.Monk
             raise KeyboardInterrupt
         record(step, work, interrupted)
 
-    monkeypatch.setattr(module, "run_step", stop_in_training)
+    monkeypatch.setattr(chain, "run_step", stop_in_training)
     with pytest.raises(KeyboardInterrupt):
-        module.run_all(tmp_path, module.SMOKE)
+        chain.run_all(tmp_path, everything)
     ran.clear()
-    module.run_all(tmp_path, module.SMOKE)
+    chain.run_all(tmp_path, everything)
     assert ran[0] == ("train", True)
     assert ran[1][0] == "start-poses"
 

@@ -1,0 +1,1 @@
+"""The experiments of the paper, each a chain of the project's own commands."""
