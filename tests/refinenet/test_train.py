@@ -5,11 +5,10 @@ import pytest
 import torch
 from posecore.errors import CheckpointError, ConfigError, StorageError
 from refinenet import checkpoint
-from refinenet.config import OptimiserConfig, load_config
+from refinenet.config import load_config
 from refinenet.errors import TrainingError
 from refinenet.metrics import MetricLog
 from refinenet.network import PaperNet
-from refinenet.optimise import learning_rate
 from refinenet.train import train
 from refinenet.trainer import Trainer
 from safetensors.torch import load_file
@@ -144,16 +143,6 @@ def test_every_loss_trains(dataset, tmp_path):
         values = trainer.take_step(next(trainer.stream()))
         assert all(np.isfinite(value) for value in values.values())
         assert ("loss_mse" in values) == (name == "mse")
-
-
-def test_learning_rate_warms_up_and_falls():
-    config = OptimiserConfig(lr=1.0, schedule="cosine", warmup_steps=10)
-    rates = [learning_rate(step, 100, config) for step in range(100)]
-    assert rates[0] == pytest.approx(0.1)
-    assert max(rates) == rates[10] == pytest.approx(1.0)
-    assert rates[10:] == sorted(rates[10:], reverse=True)
-    assert rates[-1] == pytest.approx(0.01, abs=0.001)
-    assert {learning_rate(step, 100, OptimiserConfig(lr=1.0)) for step in range(100)} == {1.0}
 
 
 @pytest.mark.slow
