@@ -4,18 +4,19 @@ import itertools
 import time
 from collections.abc import Callable, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from posecore.bop import BopDataset, Estimate
 from posecore.bop.images import write_image
+from posecore.errors import DatasetError
 
 from refinenet import __version__
 from refinenet.checkpoint import Checkpoint
+from refinenet.methods import Frame, PoseRefiner, Refinement, Request, Status
 from refinenet.overlay import REFINED_RGB, START_RGB, Overlay
-from refinenet.refine import STOP_ANGLE_DEG, STOP_DISTANCE_M, Refiner
 
 CARRIED = "perturbation"
 """What the start poses' sidecar says of how each was made goes over unchanged."""
@@ -28,22 +29,21 @@ class Refined:
     Attributes:
         estimates: In the order of the start poses, without the failed ones: evaluation counts them as missing.
         start_lines: Line in the start file of each of them.
-        failed_lines: Line in the start file of each that failed.
+        failures: Why the others failed, by their line in the start file.
         converged: How many stopped on a small update.
     """
 
     estimates: list[Estimate]
     start_lines: list[int]
-    failed_lines: list[int]
-    converged: int
+    failures: dict[int, str] = field(default_factory=dict)
+    converged: int = 0
 
 
 def refine_estimates(
     dataset: BopDataset,
     starts: Sequence[Estimate],
-    refiner: Refiner,
+    method: PoseRefiner,
     *,
-    iterations: int = 5,
     overlay: Path | None = None,
     on_image: Callable[[int], None] | None = None,
 ) -> Refined:
@@ -52,53 +52,76 @@ def refine_estimates(
     Args:
         dataset: Images and cameras.
         starts: Start poses.
-        refiner: With the meshes of all their objects.
-        iterations: Most updates of a pose.
+        method: With the meshes of all their objects.
         overlay: Folder for one picture an image, start contours red, refined ones green.
         on_image: Called after each image with the number of poses in it.
 
     Returns:
-        Estimates whose time is that of refining all poses of their image, rendering included, reading excluded.
+        Estimates whose score is the method's confidence (the start's score where it has none), and whose time is that
+        of refining all poses of their image, rendering included, reading excluded.
+
+    Raises:
+        DatasetError: The method needs depth, and an image has none.
+        CameraError: An image's camera is that of an image of another size.
     """
-    refined: list[Estimate | None] = [None] * len(starts)
-    converged = 0
+    results: list[tuple[Refinement, float] | None] = [None] * len(starts)
     order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
     drawing = closing(Overlay({i: dataset.mesh(i) for i in sorted({s.obj_id for s in starts})})) if overlay else None
     with drawing or nullcontext() as painter:
         for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
             rows = list(group)
-            image, K = dataset.rgb(scene_id, im_id), dataset.camera(scene_id, im_id).K
-            T = np.stack([starts[i].T_cam_obj for i in rows])
-            obj_id = np.array([starts[i].obj_id for i in rows])
+            frame = _frame(dataset, scene_id, im_id, method)
+            requests = [Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in rows]
             begun = time.perf_counter()
-            result = refiner.refine(image, K, T, obj_id, iterations=iterations)
+            found = method.refine_batch(frame, requests)
             taken_s = time.perf_counter() - begun
-            for k, i in enumerate(rows):
-                if not result.failed[k]:
-                    refined[i] = replace(starts[i], T_cam_obj=result.T_cam_obj[k], time_s=taken_s)
-            converged += int(result.converged.sum())
+            for i, result in zip(rows, found, strict=True):
+                results[i] = result, taken_s
             if painter is not None and overlay is not None:
-                picture = painter.draw(image, K, T, obj_id, START_RGB)
-                picture = painter.draw(picture, K, result.T_cam_obj, obj_id, REFINED_RGB)
+                picture = painter.draw(frame.image, frame.K, requests, START_RGB)
+                good = [
+                    Request(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
+                    for request, result in zip(requests, found, strict=True)
+                    if not result.failed
+                ]
+                picture = painter.draw(picture, frame.K, good, REFINED_RGB)
                 write_image(overlay / f"{scene_id:06d}_{im_id:06d}.png", picture)
             if on_image is not None:
                 on_image(len(rows))
+    pairs = [(start, *result) for start, result in zip(starts, results, strict=True) if result is not None]
+    kept = [(start, result, taken_s) for start, result, taken_s in pairs if not result.failed]
     return Refined(
-        estimates=[estimate for estimate in refined if estimate is not None],
-        start_lines=[start.line for start, estimate in zip(starts, refined, strict=True) if estimate is not None],
-        failed_lines=[start.line for start, estimate in zip(starts, refined, strict=True) if estimate is None],
-        converged=converged,
+        estimates=[_estimate(start, result, taken_s) for start, result, taken_s in kept],
+        start_lines=[start.line for start, _, _ in kept],
+        failures={start.line: result.failure or "" for start, result, _ in pairs if result.failed},
+        converged=sum(result.status is Status.CONVERGED for _, result, _ in kept),
     )
+
+
+def _frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:
+    depth_m = dataset.depth_m(scene_id, im_id) if method.needs_depth else None
+    if method.needs_depth and depth_m is None:
+        raise DatasetError(
+            f"{dataset.scene_path(scene_id)}: image {im_id} has no depth, which {method.name} needs; "
+            "choose a method that works on colour"
+        )
+    image = dataset.rgb(scene_id, im_id)
+    return Frame(image=image, K=dataset.camera(scene_id, im_id).K, depth_m=depth_m)
+
+
+def _estimate(start: Estimate, result: Refinement, taken_s: float) -> Estimate:
+    score = start.score if result.confidence is None else result.confidence
+    return replace(start, T_cam_obj=np.asarray(result.T_cam_obj), score=float(score), time_s=taken_s)
 
 
 def make_sidecar(
     *,
     dataset: BopDataset,
-    loaded: Checkpoint,
+    method: PoseRefiner,
+    name: str,
+    loaded: Checkpoint | None,
     start_path: Path,
     start_sidecar: dict[str, Any],
-    method: str,
-    iterations: int,
     refined: Refined,
 ) -> dict[str, Any]:
     """What is written beside a refined result file.
@@ -106,22 +129,14 @@ def make_sidecar(
     `start_lines` holds the start file's line of every estimate, `failed_lines` those of the poses without one. What
     the start file's own sidecar says about how its poses were perturbed is carried over.
     """
-    sidecar: dict[str, Any] = {
-        "dataset": str(dataset.root.resolve()),
-        "split": dataset.split,
-        "method": method,
-        "checkpoint": loaded.path.name,
-        "checkpoint_sha256": loaded.sha256,
-        "settings": {
-            "refinenet": __version__,
-            "preset": loaded.provenance.config.preset,
-            "step": loaded.provenance.step,
-            "iterations": iterations,
-            "stop_angle_deg": STOP_ANGLE_DEG,
-            "stop_distance_mm": 1e3 * STOP_DISTANCE_M,
-        },
+    sidecar: dict[str, Any] = {"dataset": str(dataset.root.resolve()), "split": dataset.split, "method": name}
+    if loaded is not None:
+        sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
+    sidecar |= {
+        "settings": {"refinenet": __version__, **method.settings},
         "init": start_path.name,
         "start_lines": refined.start_lines,
-        "failed_lines": refined.failed_lines,
+        "failed_lines": list(refined.failures),
+        "failures": {str(line): why for line, why in refined.failures.items()},
     }
     return sidecar | ({CARRIED: start_sidecar[CARRIED]} if CARRIED in start_sidecar else {})

@@ -3,13 +3,15 @@
 `refinenet refine --method NAME` takes the network, or a baseline that is listed in `BASELINES`.
 """
 
-from collections.abc import Sequence
+import importlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore.mesh import Mesh
 
 Array = np.ndarray
 
@@ -76,6 +78,7 @@ class Refinement:
         return self.status is Status.FAILED
 
 
+@runtime_checkable
 class PoseRefiner(Protocol):
     """A method. Its objects' meshes and its settings were given when it was made."""
 
@@ -104,3 +107,10 @@ class PoseRefiner(Protocol):
     def close(self) -> None:
         """Free what it holds."""
         ...
+
+
+def make_baseline(name: str, meshes: Mapping[int, Mesh], iterations: int) -> PoseRefiner:
+    """A method of `BASELINES`."""
+    module, _, made = BASELINES[name].partition(":")
+    refiner: PoseRefiner = getattr(importlib.import_module(module), made)(meshes, iterations=iterations)
+    return refiner

@@ -1,78 +1,102 @@
 """Iterative refinement: render the hypothesis, cut both patches, predict, update, until the update is small."""
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from posecore import se3
-from posecore.camera import crop_K
 from posecore.errors import CheckpointError
 from posecore.mesh import Mesh
-from posecore.raster import Rasteriser
-from posecore.window import Window, cut, diameter_window, fixed_window
 
 from refinenet import checkpoint
+from refinenet.agreement import gradient_agreement
 from refinenet.checkpoint import Checkpoint
 from refinenet.device import choose_device
+from refinenet.errors import RefinementError
+from refinenet.geometry import PoseUpdate
+from refinenet.inputs import require_camera, require_trained
+from refinenet.methods import Frame, Refinement, Request, Status
 from refinenet.network import Pair
+from refinenet.views import Viewer, Views
 
 Array = np.ndarray
+Scorer = Literal["gradient", "learned"]
 STOP_ANGLE_DEG = 1.5
 STOP_DISTANCE_M = 7.5e-3
-DIAMETER_TOLERANCE = 0.02
+
+log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Refinement:
-    """Refined poses.
+@dataclass(kw_only=True, eq=False)
+class _Batch:
+    """Poses while they are refined; fields are changed in place."""
 
-    Attributes:
-        T_cam_obj: (b, 4, 4) metres; the start pose where refinement failed.
-        converged: (b,) the last update was under the stop thresholds.
-        failed: (b,) at some iteration no pixel of the object could be rendered inside the image.
-        iterations: (b,) updates applied.
-    """
-
-    T_cam_obj: Float[Array, "b 4 4"]
+    T: Float[Array, "b 4 4"]
+    obj_id: Int[Array, " b"]
     converged: Bool[Array, " b"]
-    failed: Bool[Array, " b"]
     iterations: Int[Array, " b"]
+    failures: list[str | None]
+
+    def active(self) -> Int[Array, " a"]:
+        """Rows that still move."""
+        return np.array([i for i, why in enumerate(self.failures) if why is None and not self.converged[i]], np.int64)
 
 
 class Refiner:
-    """A trained network with the renderer and the window it was trained for. A context manager.
+    """A trained network with the renderer and the window it was trained for: a `PoseRefiner`, a context manager.
 
     Args:
         loaded: Checkpoint.
         meshes: Objects by id, those of the training data.
+        iterations: Most updates of a pose; it stops earlier once an update is under 1.5 deg and 7.5 mm.
         device: `auto`, `cpu` or `cuda`.
-        batch: Largest number of poses in one forward pass.
+        batch: Largest number of poses in one forward pass; halved, with a warning, where the GPU's memory is too small.
+        allow_other_mesh: Take a mesh of the trained object's size that is not the trained one.
+
+    Attributes:
+        checkpoint: Checkpoint.
+        meshes: Objects by id.
+        scorer: Where confidences come from: `learned` where the network has such an output, else `gradient`.
 
     Raises:
-        CheckpointError: An object was not trained, or is of another size than the trained one.
+        CheckpointError: An object was not trained, or its mesh is not the trained one.
+        ConfigError: A GPU is asked for and there is none.
         RenderError: There is no device to render on.
     """
 
+    needs_depth = False
+
     def __init__(
-        self, loaded: Checkpoint, meshes: Mapping[int, Mesh], *, device: str = "auto", batch: int = 64
+        self,
+        loaded: Checkpoint,
+        meshes: Mapping[int, Mesh],
+        *,
+        iterations: int = 5,
+        device: str = "auto",
+        batch: int = 64,
+        allow_other_mesh: bool = False,
     ) -> None:
         for obj_id, mesh in sorted(meshes.items()):
-            _require_trained(loaded, obj_id, mesh)
+            require_trained(loaded, obj_id, mesh, allow_other_mesh=allow_other_mesh)
         self.checkpoint = loaded
-        self._meshes = dict(meshes)
+        self.meshes = dict(meshes)
+        self._iterations = iterations
         self._device = choose_device(device)
         self._network = loaded.network().to(self._device)
         self._batch = batch
-        self._rasteriser = Rasteriser(meshes)
+        self._viewer = Viewer(meshes, loaded.provenance)
+        self.scorer: Scorer = "learned" if self._predict(*_blank(loaded)).confidence is not None else "gradient"
 
     @classmethod
-    def load(cls, path: str | Path, meshes: Mapping[int, Mesh], *, device: str = "auto", batch: int = 64) -> "Refiner":
-        """A refiner from a checkpoint file; see the class for arguments and errors."""
-        return cls(checkpoint.load(Path(path)), meshes, device=device, batch=batch)
+    def load(cls, path: str | Path, meshes: Mapping[int, Mesh], **settings: Any) -> "Refiner":
+        """A refiner from a checkpoint file; see the class for settings and errors."""
+        return cls(checkpoint.load(Path(path)), meshes, **settings)
 
     def __enter__(self) -> "Refiner":
         return self
@@ -84,141 +108,185 @@ class Refiner:
 
     def close(self) -> None:
         """Free what the renderer holds."""
-        self._rasteriser.close()
+        self._viewer.close()
+
+    @property
+    def name(self) -> str:
+        """Preset and step."""
+        provenance = self.checkpoint.provenance
+        return f"refinenet {provenance.config.preset} step {provenance.step}"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """For the sidecar."""
+        provenance = self.checkpoint.provenance
+        return {
+            "preset": provenance.config.preset,
+            "step": provenance.step,
+            "iterations": self._iterations,
+            "stop_angle_deg": STOP_ANGLE_DEG,
+            "stop_distance_mm": 1e3 * STOP_DISTANCE_M,
+            "confidence": self.scorer,
+        }
 
     def refine(
-        self,
-        image: UInt8[Array, "h w 3"],
-        K: Float[Array, "3 3"],
-        T_cam_obj: Float[Array, "b 4 4"],
-        obj_id: Int[Array, " b"],
-        *,
-        iterations: int = 5,
+        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], obj_id: int
     ) -> Refinement:
-        """Refine poses in one image, all of them together.
+        """Refine one pose; `refine_batch` takes many, and is faster than one after the other.
 
         Args:
-            image: RGB.
+            image: RGB, of any size.
             K: Its camera.
-            T_cam_obj: Start poses, metres.
-            obj_id: Object of each.
-            iterations: Most updates of a pose; it stops earlier once an update is under 1.5 deg and 7.5 mm.
+            T_cam_obj: Start pose, metres.
+            obj_id: Object.
+
+        Raises:
+            CameraError: K is no camera matrix, or that of an image of another size.
+            RefinementError: The GPU's memory is too small for a single pose.
         """
-        b = len(T_cam_obj)
-        T = np.asarray(T_cam_obj, np.float64).copy()
-        converged, failed, count = np.zeros(b, bool), np.zeros(b, bool), np.zeros(b, np.int64)
-        for _ in range(iterations):
-            active = np.flatnonzero(~(converged | failed))
+        return self.refine_batch(Frame(image=image, K=K), [Request(obj_id=obj_id, T_cam_obj=T_cam_obj)])[0]
+
+    def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+        """Refine poses in one image, of any objects, all of them together; see `refine` for errors."""
+        require_camera(frame)
+        b = len(requests)
+        batch = _Batch(
+            T=_poses(requests), obj_id=_objects(requests), converged=np.zeros(b, bool),
+            iterations=np.zeros(b, np.int64), failures=[None] * b,
+        )  # fmt: skip
+        for _ in range(self._iterations):
+            active = batch.active()
             for first in range(0, len(active), self._batch):
-                rows = active[first : first + self._batch]
-                seen, dR, dt_m = self._updates(image, K, T[rows], obj_id[rows])
-                failed[rows[~seen]] = True
-                moved = rows[seen]
-                T[moved] = se3.apply_update(T[moved], dR, dt_m)
-                count[moved] += 1
-                small = np.rad2deg(se3.rotation_angle_rad(dR)) < STOP_ANGLE_DEG
-                converged[moved] = small & (np.linalg.norm(dt_m, axis=-1) < STOP_DISTANCE_M)
+                self._update(frame, batch, active[first : first + self._batch])
         # The last update is followed by no render of its own, so where it led is looked at here.
-        left = np.flatnonzero(~failed)
-        failed[left[~self._seen(image, K, T[left], obj_id[left])]] = True
-        T[failed] = T_cam_obj[failed]
-        return Refinement(T_cam_obj=T, converged=converged & ~failed, failed=failed, iterations=count)
+        left = np.array([i for i, why in enumerate(batch.failures) if why is None], np.int64)
+        confidence, failures = self._judge(frame, batch.T[left], batch.obj_id[left], scorer=None)
+        for row, why in zip(left, failures, strict=True):
+            batch.failures[row] = why and f"after {batch.iterations[row]} updates {why}"
+        of_row = dict(zip(left.tolist(), confidence.tolist(), strict=True))
+        return [
+            Refinement(
+                T_cam_obj=np.asarray(request.T_cam_obj, np.float64) if why else batch.T[i],
+                status=Status.FAILED if why else Status.CONVERGED if batch.converged[i] else Status.STOPPED,
+                iterations=int(batch.iterations[i]),
+                confidence=0.0 if why else of_row[i],
+                failure=why,
+            )
+            for i, (request, why) in enumerate(zip(requests, batch.failures, strict=True))
+        ]
 
-    def _seen(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]
-    ) -> Bool[Array, " b"]:
-        """Which poses show at least one pixel of the object inside the image."""
-        return self._hypotheses(image, K, T, obj_id)[0]
+    def confidences(
+        self, frame: Frame, requests: Sequence[Request], scorer: Scorer | None = None
+    ) -> Float[Array, " b"]:
+        """How well poses fit as they are, in [0, 1]; 0 for one that cannot be seen.
 
-    def _hypotheses(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]
-    ) -> tuple[Bool[Array, " b"], list[Window], Float[Array, "s 3 3"], UInt8[Array, "s p p 3"]]:
-        """Which poses can be seen in the image; of those the windows, their cameras and the renders."""
-        p = self.checkpoint.provenance.config.network.patch_px
-        windows = [self._window(K, pose, int(i)) for pose, i in zip(T, obj_id, strict=True)]
-        rgb, seen = np.zeros((len(T), p, p, 3), np.uint8), np.zeros(len(T), bool)
-        K_crop = (
-            np.stack([np.eye(3) if w is None else crop_K(K, w, p) for w in windows]) if windows else np.zeros((0, 3, 3))
-        )
-        drawable = np.array([window is not None for window in windows], bool)
-        for i in np.unique(obj_id[drawable]):
-            rows = np.flatnonzero(drawable & (obj_id == i))
-            layers = self._rasteriser.render(int(i), K_crop[rows], T[rows], p, p)
-            rgb[rows] = layers.rgb
-            for row, mask in zip(rows, layers.mask, strict=True):
-                window = windows[row]
-                assert window is not None
-                seen[row] = (mask & _inside(window, p, image.shape[1], image.shape[0])).any()
-        kept = [window for window, ok in zip(windows, seen, strict=True) if ok and window is not None]
-        return seen, kept, K_crop[seen], rgb[seen]
+        Args:
+            frame: Image and camera.
+            requests: Objects and poses.
+            scorer: `gradient` compares gradients of render and image (`agreement`), `learned` asks the network; by
+                default what the attribute `scorer` says.
 
-    def _updates(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]
-    ) -> tuple[Bool[Array, " b"], Float[Array, "s 3 3"], Float[Array, "s 3"]]:
-        """Which poses can be seen in the image, and the updates of those."""
-        seen, windows, K_crop, hypothesis_rgb = self._hypotheses(image, K, T, obj_id)
-        if not seen.any():
-            return seen, np.zeros((0, 3, 3)), np.zeros((0, 3))
-        p = self.checkpoint.provenance.config.network.patch_px
-        scenes = np.stack([cut_patch(image, window, p) for window in windows])
-        pair = Pair(
-            scene_rgb=self._tensor(scenes.transpose(0, 3, 1, 2)),
-            hypothesis_rgb=self._tensor(hypothesis_rgb.transpose(0, 3, 1, 2)),
-            T_cam_obj=self._tensor(T[seen].astype(np.float32)),
-            K_crop=self._tensor(K_crop.astype(np.float32)),
-        )
-        with torch.no_grad():
-            update = self._network(pair)
+        Raises:
+            CheckpointError: `learned` was asked for and the network has no such output.
+        """
+        return self._judge(frame, _poses(requests), _objects(requests), scorer)[0]
+
+    def _update(self, frame: Frame, batch: _Batch, rows: Int[Array, " a"]) -> None:
+        """One update of these rows."""
+        views = self._viewer.look(frame, batch.T[rows], batch.obj_id[rows])
+        for row, why in zip(rows, views.failures, strict=True):
+            batch.failures[row] = why
+        if not len(views.rows):
+            return
+        moved = rows[views.rows]
+        update = self._predict(views, batch.T[moved])
         # float32 products drift from orthonormal over many iterations, so each update is made a rotation again.
-        return seen, se3.nearest_rotation(update.dR.double().cpu().numpy()), update.dt.double().cpu().numpy()
+        dR, dt_m = se3.nearest_rotation(update.dR.double().cpu().numpy()), update.dt.double().cpu().numpy()
+        batch.T[moved] = se3.apply_update(batch.T[moved], dR, dt_m)
+        batch.iterations[moved] += 1
+        small = np.rad2deg(se3.rotation_angle_rad(dR)) < STOP_ANGLE_DEG
+        batch.converged[moved] = small & (np.linalg.norm(dt_m, axis=-1) < STOP_DISTANCE_M)
+
+    def _judge(
+        self, frame: Frame, T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"], scorer: Scorer | None
+    ) -> tuple[Float[Array, " b"], list[str | None]]:
+        """Confidence of poses, and why some cannot be seen."""
+        confidence, failures = np.zeros(len(T)), []
+        for first in range(0, len(T), self._batch):
+            part = slice(first, first + self._batch)
+            views = self._viewer.look(frame, T[part], obj_id[part])
+            failures += views.failures
+            if len(views.rows):
+                confidence[part][views.rows] = self._confidence(views, T[part][views.rows], scorer)
+        return confidence, failures
+
+    def _confidence(self, views: Views, T: Float[Array, "s 4 4"], scorer: Scorer | None) -> Float[Array, " s"]:
+        if (scorer or self.scorer) == "learned":
+            logit = self._predict(views, T).confidence
+            if logit is None:
+                raise CheckpointError(
+                    f"{self.checkpoint.path}: its network has no confidence output; choose --scorer gradient"
+                )
+            return np.asarray(torch.sigmoid(logit.double()).cpu().numpy())
+        return gradient_agreement(views.scene_rgb, views.hypothesis_rgb, views.mask, views.inside)
+
+    def _predict(self, views: Views, T: Float[Array, "s 4 4"]) -> PoseUpdate:
+        """The network's update of these views, in as many passes as memory asks for."""
+        wanted = self._batch
+        while True:
+            try:
+                parts = [self._forward(views, T, first) for first in range(0, len(T), self._batch)]
+                break
+            except torch.OutOfMemoryError as error:
+                if min(self._batch, len(T)) == 1:
+                    raise RefinementError(
+                        "the GPU's memory is too small for a single pose; free it, or run with --device cpu"
+                    ) from error
+                self._batch = min(self._batch, len(T)) // 2
+        if self._batch != wanted:
+            fits = self._batch
+            log.warning(
+                "a batch of %d poses does not fit into the GPU's memory, %d do; use --batch %d", wanted, fits, fits
+            )
+        confidences = [part.confidence for part in parts if part.confidence is not None]
+        return PoseUpdate(
+            torch.cat([part.dR for part in parts]),
+            torch.cat([part.dt for part in parts]),
+            torch.cat(confidences) if confidences else None,
+        )
+
+    def _forward(self, views: Views, T: Float[Array, "s 4 4"], first: int) -> PoseUpdate:
+        part = slice(first, first + self._batch)
+        pair = Pair(
+            scene_rgb=self._tensor(views.scene_rgb[part].transpose(0, 3, 1, 2)),
+            hypothesis_rgb=self._tensor(views.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
+            T_cam_obj=self._tensor(T[part].astype(np.float32)),
+            K_crop=self._tensor(views.K_crop[part].astype(np.float32)),
+        )
+        with torch.inference_mode():
+            update: PoseUpdate = self._network(pair)
+        return update
 
     def _tensor(self, values: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
 
-    def _window(self, K: Float[Array, "3 3"], T: Float[Array, "4 4"], obj_id: int) -> Window | None:
-        """The window a pose is looked at through; None for one at or behind the camera, or that is not finite."""
-        mesh = self._meshes[obj_id]
-        if not np.isfinite(T).all() or (T[:3, :3] @ mesh.center_m + T[:3, 3])[2] < 0.6 * mesh.diameter_m:
-            return None
-        provenance = self.checkpoint.provenance
-        if provenance.config.window.kind == "diameter":
-            return diameter_window(K, T, mesh.center_m, mesh.diameter_m, provenance.config.window.scale)
-        side_px = float(provenance.objects[str(obj_id)]["window_side_px"])
-        # The same share of the field of view as in training, so that another camera shows the object at the same size.
-        scale = float(K[0, 0]) / provenance.camera_fx_px if provenance.camera_fx_px > 0 else 1.0
-        return fixed_window(mesh.vertices_m, K, T, side_px * scale)
+
+def _poses(requests: Sequence[Request]) -> Float[Array, "b 4 4"]:
+    return np.array([request.T_cam_obj for request in requests], np.float64).reshape(-1, 4, 4)
 
 
-def cut_patch(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
-    """The scene patch of a window, antialiased, black outside the image; touches only the window's part of it."""
-    margin = 8 + int(2 * window.side_px / patch_px)
-    x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
-    x1, y1 = int(x0 + window.side_px + 2 * margin + 2), int(y0 + window.side_px + 2 * margin + 2)
-    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, image.shape[1]), min(y1, image.shape[0])
-    if x1 <= x0 or y1 <= y0:
-        return np.zeros((patch_px, patch_px, 3), np.uint8)
-    part = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
-    return np.asarray(cut(np.ascontiguousarray(image[y0:y1, x0:x1]), part, patch_px, interpolation="area"))
+def _objects(requests: Sequence[Request]) -> Int[Array, " b"]:
+    return np.array([request.obj_id for request in requests], np.int64)
 
 
-def _inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[Array, "p p"]:
-    """Which patch pixels lie in the image."""
-    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
-    u, v = window.x0_px + centre, window.y0_px + centre
-    return ((v >= 0) & (v < height_px))[:, None] & ((u >= 0) & (u < width_px))[None]
-
-
-def _require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh) -> None:
-    objects = loaded.provenance.objects
-    if str(obj_id) not in objects:
-        known = ", ".join(sorted(objects, key=int))
-        raise CheckpointError(
-            f"{loaded.path}: object {obj_id} was not in its training data (objects {known}); "
-            "choose another checkpoint, or name the objects to refine with --object"
-        )
-    trained_m = float(objects[str(obj_id)]["diameter_m"])
-    if abs(mesh.diameter_m / trained_m - 1) > DIAMETER_TOLERANCE:
-        raise CheckpointError(
-            f"{loaded.path}: object {obj_id} had a diameter of {1e3 * trained_m:.1f} mm in training, this one has "
-            f"{1e3 * mesh.diameter_m:.1f} mm: another object, or another unit"
-        )
+def _blank(loaded: Checkpoint) -> tuple[Views, Float[Array, "1 4 4"]]:
+    """An empty view, to see what a network gives."""
+    p = loaded.provenance.config.network.patch_px
+    black, off = np.zeros((1, p, p, 3), np.uint8), np.zeros((1, p, p), bool)
+    K, T = np.array([[[p, 0, p / 2], [0, p, p / 2], [0, 0, 1.0]]]), np.eye(4)[None].copy()
+    T[0, 2, 3] = 1.0
+    views = Views(
+        failures=[None], rows=np.zeros(1, np.int64), K_crop=K, scene_rgb=black, hypothesis_rgb=black, mask=off,
+        inside=off,
+    )  # fmt: skip
+    return views, T

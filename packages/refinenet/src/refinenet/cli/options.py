@@ -12,5 +12,11 @@ device_option = click.option(
 threads_option = click.option(
     "--threads", type=click.IntRange(0), default=0, help="Torch threads; 0 leaves torch's choice."
 )
+iterations_option = click.option(
+    "--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose; fewer once one is small."
+)
+other_mesh_option = click.option(
+    "--allow-other-mesh", is_flag=True, help="Take a mesh of the trained object's size that is not the trained one."
+)
 quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
 verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")

@@ -1,81 +1,136 @@
 """`refinenet refine`."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from posecore.errors import ConfigError
 
 from refinenet.cli.console import progress_bar, start_logging, stoppable
-from refinenet.cli.options import FILE, NEW_FILE, device_option, quiet_option, threads_option, verbose_option
+from refinenet.cli.options import (
+    FILE,
+    NEW_FILE,
+    device_option,
+    iterations_option,
+    other_mesh_option,
+    quiet_option,
+    threads_option,
+    verbose_option,
+)
+from refinenet.methods import BASELINES, NETWORK, make_baseline
+
+if TYPE_CHECKING:
+    from refinenet.pool import PoolScorer
+
+SHOWN_FAILURES = 5
 
 
 @click.command()
-@click.option("--checkpoint", required=True, type=FILE, metavar="FILE", help="Trained network (.safetensors).")
+@click.option("--method", type=click.Choice([NETWORK, *BASELINES]), default=NETWORK, help="What refines the poses.")
+@click.option("--checkpoint", type=FILE, metavar="FILE", help="Trained network (.safetensors), for --method network.")
 @click.option("--dataset", required=True, type=FILE, metavar="DIR", help="BOP dataset with the images.")
 @click.option("--split", metavar="NAME", help="Split folder. [test, val, train_pbr, train or the only one]")
 @click.option("--init", required=True, type=FILE, metavar="CSV", help="Start poses, a BOP result file.")
 @click.option("--out", required=True, type=NEW_FILE, metavar="CSV", help="Refined poses, a BOP result file.")
-@click.option("--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose.")
+@iterations_option
+@click.option(
+    "--hypotheses",
+    type=click.IntRange(1),
+    default=1,
+    help="Poses tried for each start pose: itself, and some around it.",
+)
+@click.option(
+    "--scorer", type=click.Choice(["gradient", "learned", "none"]), default="gradient",
+    help="What picks the quarter of the hypotheses that is refined: image gradients, the network; none refines all.",
+)  # fmt: skip
+@click.option("--seed", type=click.IntRange(0), default=0, help="Of the hypotheses.")
 @click.option("--object", "objects", type=int, multiple=True, help="Refine only this object's poses. Repeatable. [all]")
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
 @click.option("--overlay", type=FILE, metavar="DIR", help="Draw start (red) and refined (green) contours here.")
 @device_option
 @click.option("--batch", type=click.IntRange(1), default=64, help="Most poses in one forward pass.")
 @threads_option
+@other_mesh_option
 @quiet_option
 @verbose_option
 def refine(
-    checkpoint: Path,
+    method: str,
+    checkpoint: Path | None,
     dataset: Path,
     split: str | None,
     init: Path,
     out: Path,
     iterations: int,
+    hypotheses: int,
+    scorer: "PoolScorer",
+    seed: int,
     objects: tuple[int, ...],
     name: str | None,
     overlay: Path | None,
     device: str,
     batch: int,
     threads: int,
+    allow_other_mesh: bool,
     quiet: bool,
     verbose: bool,
 ) -> None:
     """Refine BOP estimates; the result file's sidecar says with what.
 
-    Exit code 0 also when some poses fail: they keep their start pose, get score 0, and are counted on the last line.
+    A refined pose's score is how well it fits the image, from 0 to 1. Exit code 0 also when some poses fail: they are
+    left out of the file, named on stderr with the reason, and counted on the last line.
 
     \b
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out results/refined.csv
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out ten.csv --iterations 10
+    refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out pool.csv --hypotheses 16
     """
     start_logging(verbose)
+    if (checkpoint is None) == (method == NETWORK):
+        needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
+        raise click.UsageError(f"--method {method} {needs}")
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 
     from refinenet import checkpoint as checkpoints
     from refinenet.estimates import make_sidecar, refine_estimates
+    from refinenet.methods import PoseRefiner
+    from refinenet.pool import PooledRefiner
     from refinenet.refine import Refiner
 
     if threads:
         torch.set_num_threads(threads)
-    loaded = checkpoints.load(checkpoint)
+    loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     bop = BopDataset(dataset, split)
     starts = [s for s in read_results(init, bop) if not objects or s.obj_id in objects]
     if not starts:
         raise ConfigError(f"{init}: no pose of object {', '.join(map(str, objects))}; change --object")
     meshes = {i: bop.mesh(i) for i in sorted({s.obj_id for s in starts})}
-    with Refiner(loaded, meshes, device=device, batch=batch) as refiner, stoppable(out), progress_bar(quiet) as bar:
-        task = bar.add_task("poses", total=len(starts))
-        result = refine_estimates(
-            bop, starts, refiner, iterations=iterations, overlay=overlay, on_image=lambda n: bar.advance(task, n)
+    if loaded is None:
+        refiner: PoseRefiner = make_baseline(method, meshes, iterations)
+    else:
+        network = Refiner(
+            loaded, meshes, iterations=iterations, device=device, batch=batch, allow_other_mesh=allow_other_mesh
         )
-    method = name or f"refinenet {loaded.provenance.config.preset} step {loaded.provenance.step}"
+        refiner = network if hypotheses == 1 else PooledRefiner(network, hypotheses, scorer, seed)
+    try:
+        with stoppable(out), progress_bar(quiet) as bar:
+            task = bar.add_task("poses", total=len(starts))
+            result = refine_estimates(bop, starts, refiner, overlay=overlay, on_image=lambda n: bar.advance(task, n))
+    finally:
+        refiner.close()
     sidecar = make_sidecar(
-        dataset=bop, loaded=loaded, start_path=init, start_sidecar=read_sidecar(init) or {},
-        method=method, iterations=iterations, refined=result,
+        dataset=bop, method=refiner, name=name or refiner.name, loaded=loaded, start_path=init,
+        start_sidecar=read_sidecar(init) or {}, refined=result,
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
+    of_line = {start.line: start for start in starts}
+    for line, why in list(result.failures.items())[:SHOWN_FAILURES]:
+        start = of_line[line]
+        where = f"{init}:{line}: scene {start.scene_id}, image {start.im_id}, object {start.obj_id}"
+        click.echo(f"Failed: {where}: {why}", err=True)
+    if len(result.failures) > SHOWN_FAILURES:
+        click.echo(f"Failed: {len(result.failures) - SHOWN_FAILURES} more, listed in {out}.json", err=True)
     click.echo(
-        f"{out}: {len(starts)} poses refined, {result.converged} converged, {len(result.failed_lines)} failed"
-        + (" (left out of the file: the object could not be seen)" if result.failed_lines else "")
+        f"{out}: {len(starts)} poses refined, {result.converged} converged, {len(result.failures)} failed"
+        + (" (left out of the file)" if result.failures else "")
     )

@@ -1,0 +1,86 @@
+"""What is checked before a pose is refined: the object, the camera, the units."""
+
+import hashlib
+
+import numpy as np
+from posecore.camera import Camera
+from posecore.errors import CameraError, CheckpointError
+from posecore.mesh import Mesh
+
+from refinenet.checkpoint import Checkpoint
+from refinenet.methods import Frame
+
+DIAMETER_TOLERANCE = 0.02
+CENTRE_TOLERANCE = 0.2
+"""A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
+that of an image of another size."""
+
+
+def mesh_digest(mesh: Mesh) -> str:
+    """Hash of what a mesh looks like: vertices (float32 millimetres), faces, colours, texture.
+
+    Unlike the file's hash it stays the same when the mesh is written anew, as BOP datasets do.
+    """
+    digest = hashlib.sha256((1e3 * mesh.vertices_m).astype("<f4").tobytes())
+    digest.update(mesh.faces.astype("<i4").tobytes())
+    for colours in (mesh.vertex_rgb, mesh.texture_rgb):
+        digest.update(b"-" if colours is None else np.ascontiguousarray(colours).tobytes())
+    return digest.hexdigest()
+
+
+def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:
+    """Refuse a mesh that the checkpoint was not trained with.
+
+    The hash decides: that of the file, or `mesh_digest`. A checkpoint that has no `mesh_digest` cannot tell a mesh
+    that was written anew from another one of its size; such a mesh passes.
+
+    Raises:
+        CheckpointError: The object is not in the training data, has another size, or is another mesh.
+    """
+    objects = loaded.provenance.objects
+    if str(obj_id) not in objects:
+        known = ", ".join(sorted(objects, key=int))
+        raise CheckpointError(
+            f"{loaded.path}: object {obj_id} was not in its training data (objects {known}); "
+            "choose another checkpoint, or name the objects to refine with --object"
+        )
+    trained = objects[str(obj_id)]
+    if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
+        return
+    trained_m = float(trained["diameter_m"])
+    ratio = mesh.diameter_m / trained_m
+    if abs(ratio - 1) > DIAMETER_TOLERANCE:
+        unit = next((word for factor, word in _UNITS.items() if abs(ratio / factor - 1) < DIAMETER_TOLERANCE), None)
+        why = f"it was read in {unit} too large a unit" if ratio > 1 and unit else "another object, or another unit"
+        why = f"it was read in {unit} too small a unit" if ratio < 1 and unit else why
+        raise CheckpointError(
+            f"{loaded.path}: object {obj_id} had a diameter of {1e3 * trained_m:.1f} mm in training, this one has "
+            f"{1e3 * mesh.diameter_m:.6g} mm: {why}"
+        )
+    if "mesh_digest" in trained and mesh_digest(mesh) != trained["mesh_digest"] and not allow_other_mesh:
+        raise CheckpointError(
+            f"{loaded.path}: object {obj_id} is another mesh than in training ({mesh.path or 'this one'} has digest "
+            f"{mesh_digest(mesh)[:12]}, {trained.get('name', 'the trained one')} had {trained['mesh_digest'][:12]}); "
+            "give the mesh it was trained with, or pass --allow-other-mesh"
+        )
+
+
+_UNITS = {1e3: "a thousand times", 1e-3: "a thousand times", 10.0: "ten times", 0.1: "ten times"}
+
+
+def require_camera(frame: Frame) -> None:
+    """Refuse a camera matrix that is none, or that of an image of another size.
+
+    Raises:
+        CameraError: So it is.
+    """
+    height, width = frame.image.shape[:2]
+    K = Camera(K=frame.K, width_px=width, height_px=height).K
+    across, down = K[0, 2] / width, K[1, 2] / height
+    is_scaled = abs(across - down) < 0.1 and min(abs(across - 0.5), abs(down - 0.5)) > CENTRE_TOLERANCE
+    if not (0 <= across <= 1 and 0 <= down <= 1) or is_scaled:
+        raise CameraError(
+            f"camera matrix: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not fit an image of "
+            f"{width} x {height} px; it looks like that of {2 * K[0, 2]:.0f} x {2 * K[1, 2]:.0f} px: "
+            "scale K with the image"
+        )
