@@ -1,0 +1,359 @@
+"""What the experiments share: sizes, networks and methods to compare, and the chain from meshes to a report."""
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from posecore.bop import read_results
+
+from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, shown, typed, words
+
+TUG, BOBBIN = (ROOT / "examples" / "objects" / f"{name}.ply" for name in ("tug", "bobbin"))
+SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
+BASELINES: tuple[str, ...] = ()
+SCORES = (
+    "expected", "missing", "vss_mean", "re_sym_deg_mean", "re_sym_deg_median", "tx_mm_mean", "ty_mm_mean", "tz_mm_mean",
+    "add_s_recall_0.1d",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inputs:
+    """What the user has beside this repository.
+
+    Attributes:
+        data: LM-O in BOP layout: `models/`, `test/`, `test_targets_bop19.json`, and start poses.
+        backbone_weights: ImageNet weights of InceptionV3's stem; without them preset `paper` has its own stem's.
+        backgrounds: Folder of photographs to put behind objects.
+    """
+
+    data: Path | None = None
+    backbone_weights: Path | None = None
+    backgrounds: Path | None = None
+
+    def models(self) -> Path:
+        """Folder of LM-O's meshes.
+
+        Raises:
+            SystemExit: There is none.
+        """
+        found = None if self.data is None else self.data / "models"
+        if found is None or not (found / "models_info.json").is_file():
+            raise SystemExit(
+                f"Error: no LM-O meshes: found {'no --data' if found is None else f'no {found}/models_info.json'}, "
+                "expected --data FOLDER with models/, test/ and test_targets_bop19.json as BOP publishes them"
+            )
+        return found
+
+    def stem(self) -> str:
+        """Options of `refinenet train` for the frozen stem of preset `paper`."""
+        if self.backbone_weights is None:
+            return ""
+        return f"--set backbone.name=inception_v3 --backbone-weights {quoted(self.backbone_weights)}"
+
+    def behind(self) -> str:
+        """Options of `synthgen` for what lies behind objects."""
+        return "" if self.backgrounds is None else f"--backgrounds {quoted(self.backgrounds)}"
+
+
+def lmo_meshes(inputs: Inputs) -> dict[int, str]:
+    """Options of `synthgen` for each of LM-O's meshes, by object id."""
+    models = inputs.models()
+    info = quoted(models / "models_info.json")
+    files = sorted(models.glob("obj_*.ply"))
+    return {int(file.stem[4:]): f"--object {quoted(file)} --models-info {info}" for file in files}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Network:
+    """One network to train, or a checkpoint that is there.
+
+    Attributes:
+        train: Options of `refinenet train`.
+        pairs: Options of `synthgen render` for its training pairs beside those of the experiment.
+        checkpoint: Taken as it is, instead of training.
+    """
+
+    train: str = ""
+    pairs: str = ""
+    checkpoint: Path | None = None
+
+
+def small_networks(options: str, names: tuple[str, ...]) -> dict[str, Network]:
+    """Preset `compact` with each loss; the name `compact` is the preset as it is, with its contour and point loss."""
+    pairs = "--set patch_px=128 --set window.padding=0.6 --set hypotheses_per_scene=1"
+    losses = {name: "" if name == "compact" else f" --loss {name}" for name in names}
+    return {name: Network(train=f"--preset compact{loss} {options}", pairs=pairs) for name, loss in losses.items()}
+
+
+def full_networks(inputs: Inputs) -> dict[str, Network]:
+    """Preset `paper` with each loss, 100 000 steps of 16 pairs."""
+    losses = ("mse", "contour-forward", "contour")
+    return {loss: Network(train=f"--preset paper --loss {loss} {inputs.stem()}") for loss in losses}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """Refinement methods side by side, from the same start poses.
+
+    Attributes:
+        objects: Options of `synthgen` that name the meshes.
+        each: Meshes with a network of their own by object id; empty where one network serves all objects.
+        scenes: Options of `synthgen` for both training pairs and test images.
+        pairs: Training pairs of one network.
+        frames: Test images.
+        networks: By the name in the report.
+        baselines: Methods without a network.
+        starts: Options of `evalkit perturb`.
+        iterations: Most updates of a pose.
+        dataset: Real test images, instead of rendered ones.
+        init: Start poses for them, instead of perturbed ones.
+        by: Rows of the paper's tables.
+        workers: Processes that render.
+    """
+
+    objects: str
+    each: Mapping[int, str] = field(default_factory=dict)
+    scenes: str
+    pairs: int
+    frames: int
+    networks: Mapping[str, Network]
+    baselines: tuple[str, ...] = BASELINES
+    starts: str = ""
+    iterations: int = 5
+    dataset: Path | None = None
+    init: Path | None = None
+    by: str = "object"
+    workers: int = 2
+
+
+def compared(work: Path, what: Comparison) -> list[Step]:
+    """The chain of a comparison: pairs, networks, test images, start poses, every method's poses, report, tables."""
+    folder = quoted(work)
+    dataset = f"{folder}/test_bop" if what.dataset is None else quoted(what.dataset)
+    init = f"{folder}/results/start.csv" if what.init is None else quoted(what.init)
+    steps = [*trainings(work, what)]
+    if what.dataset is None:
+        steps.append(rendered_frames(work, what.objects, f"{what.scenes} --workers {what.workers}", what.frames))
+    if what.init is None:
+        steps.append(start_poses(work, what.starts))
+    refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations}"
+    results = []
+    for name, network in what.networks.items():
+        steps += refinements(work, what, refine, name, network)
+        results.append(name)
+    for name in what.baselines:
+        steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))
+        results.append(name)
+    named = " ".join(f"--results {path}" for path in [init, *(f"{folder}/results/{name}.csv" for name in results)])
+    steps.append(report(work, f"--dataset {dataset} {named}"))
+    return steps
+
+
+def trainings(work: Path, what: Comparison) -> Iterator[Step]:
+    """Render the pairs that networks train on and train them; networks of the same pairs share them."""
+    folder = quoted(work)
+    groups = {f"_{number:06d}": mesh for number, mesh in what.each.items()} or {"": what.objects}
+    trained = {name: network for name, network in what.networks.items() if network.checkpoint is None}
+    kinds = list(dict.fromkeys(network.pairs for network in trained.values()))
+    for group, objects in groups.items():
+        for kind, options in enumerate(kinds):
+            out = f"shards{kind or ''}{group}"
+            yield Step(
+                name=out,
+                why=f"Training pairs{f', object {int(group[1:])}' if group else ''}, from meshes alone.",
+                command=words(
+                    f"synthgen render {objects} {what.scenes} {options} --n {what.pairs} --seed 1"
+                    f" --workers {what.workers} --out {folder}/{out}"
+                ),
+                leaves=f"{out}/manifest.jsonl",
+            )
+        for name, network in trained.items():
+            run = f"run_{name}{group}"
+            yield Step(
+                name=f"train-{name}{group}",
+                why=f"Network '{name}'{f', object {int(group[1:])}' if group else ''}.",
+                command=words(
+                    f"refinenet train {folder}/shards{kinds.index(network.pairs) or ''}{group} {network.train}"
+                    f" --seed 0 --out {folder}/{run}"
+                ),
+                leaves=f"{run}/best.safetensors",
+                run=run,
+            )
+
+
+def rendered_frames(work: Path, objects: str, options: str, frames: int, out: str = "test_bop") -> Step:
+    """Test images with ground truth: scenes of another seed than the training pairs'."""
+    return Step(
+        name=out,
+        why="Test images with ground truth: other scenes.",
+        command=words(f"synthgen bop {objects} {options} --frames {frames} --seed 102 --out {quoted(work)}/{out}"),
+        leaves=f"{out}/models/models_info.json",
+    )
+
+
+def start_poses(work: Path, options: str, dataset: str = "test_bop", name: str = "start") -> Step:
+    """Start poses: ground truth, perturbed."""
+    folder = quoted(work)
+    return Step(
+        name=f"{name}-poses",
+        why="Start poses: ground truth, perturbed.",
+        command=words(
+            f"evalkit perturb --dataset {folder}/{dataset} {options} --seed 103 --out {folder}/results/{name}.csv"
+        ),
+        leaves=f"results/{name}.csv",
+    )
+
+
+def refinements(work: Path, what: Comparison, refine: str, name: str, network: Network) -> Iterator[Step]:
+    """Refine with a network; where each object has its own, one after another and then joined."""
+    folder, why = quoted(work), f"Refined by network '{name}'."
+    if network.checkpoint is not None:
+        yield refinement(work, f"{refine} --checkpoint {quoted(network.checkpoint)}", name, why)
+    elif not what.each:
+        yield refinement(work, f"{refine} --checkpoint {folder}/run_{name}/best.safetensors", name, why)
+    else:
+        parts = [f"{name}_{number:06d}" for number in what.each]
+        for number, part in zip(what.each, parts, strict=True):
+            chosen = f"--object {number} --checkpoint {folder}/run_{part}/best.safetensors"
+            yield refinement(work, f"{refine} {chosen}", part, f"Object {number}, refined by its network.", "parts")
+        files = " ".join(f"{folder}/parts/{part}.csv" for part in parts)
+        yield Step(
+            name=f"join-{name}",
+            why=f"All objects of '{name}' in one result file.",
+            command=words(
+                f"python {quoted(ROOT / 'experiments' / 'join.py')} {files} --out {folder}/results/{name}.csv"
+            ),
+            leaves=f"results/{name}.csv",
+        )
+
+
+def refinement(work: Path, refine: str, name: str, why: str, place: str = "results") -> Step:
+    """One result file."""
+    return Step(
+        name=f"refine-{name}",
+        why=why,
+        command=words(f"{refine} --name {name} --out {quoted(work)}/{place}/{name}.csv"),
+        leaves=f"{place}/{name}.csv",
+    )
+
+
+def report(work: Path, options: str, name: str = "report") -> Step:
+    """The evaluation, on one page."""
+    return Step(
+        name=name,
+        why="What came of it, on one page.",
+        command=words(f"evalkit report {options} --out {quoted(work)}/{name}"),
+        leaves=f"{name}/summary.json",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Experiment:
+    """One row of the paper's experiments.
+
+    Attributes:
+        name: The file's name.
+        doc: The file's docstring.
+        paper: The paper's figures, by what they are of.
+        minutes: By size, what to expect.
+        plan: From working folder, size and inputs to the commands.
+        measured: What the result holds beside the report's scores, read from the working folder.
+    """
+
+    name: str
+    doc: str
+    paper: Mapping[str, str]
+    minutes: Mapping[str, str]
+    plan: Callable[[Path, str, Inputs], list[Step]]
+    measured: Callable[[Path], dict[str, Any]] = lambda _work: {}
+
+
+def run(experiment: Experiment) -> int:
+    """Run an experiment from the command line.
+
+    Returns:
+        Exit code.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"{experiment.name}.py", description=experiment.doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("work", nargs="?", type=Path, default=None, help="working folder (experiment-NAME-SIZE)")
+    sizes = parser.add_mutually_exclusive_group()
+    for size, minutes in experiment.minutes.items():
+        sizes.add_argument(f"--{size}", dest="size", action="store_const", const=size, help=minutes)
+    parser.set_defaults(size="small")
+    parser.add_argument("--data", type=Path, help="LM-O in BOP layout: models/, test/, test_targets_bop19.json")
+    parser.add_argument("--backbone-weights", type=Path, help="ImageNet weights of InceptionV3's stem (safetensors)")
+    parser.add_argument("--backgrounds", type=Path, help="photographs to put behind objects")
+    parser.add_argument("--list", action="store_true", help="show the commands and run none")
+    chosen = parser.parse_args()
+    work = (chosen.work or Path(f"experiment-{experiment.name}-{chosen.size}")).resolve()
+    given = {name: getattr(chosen, name) for name in ("data", "backbone_weights", "backgrounds")}
+    for name, path in given.items():
+        if path is not None and not path.exists():
+            raise SystemExit(f"Error: --{name.replace('_', '-')} {path}: there is no such file or folder")
+    inputs = Inputs(**{name: None if path is None else path.resolve() for name, path in given.items()})
+    steps = experiment.plan(work, chosen.size, inputs)
+    if chosen.list:
+        for step in steps:
+            say(typed(step, work, step.command))
+        return 0
+    say(f"Working in {shown(work)}; {experiment.minutes[chosen.size]}. Stop with Ctrl-C, start again to go on.")
+    try:
+        run_all(work, steps)
+    except KeyboardInterrupt:
+        raise SystemExit("\nStopped. The same command goes on from here.") from None
+    say(f"\nReport: {work / 'report' / 'index.html'}")
+    say(f"Result: {write_result(experiment, work, chosen.size, inputs, steps)}")
+    return 0
+
+
+def write_result(experiment: Experiment, work: Path, size: str, inputs: Inputs, steps: list[Step]) -> Path:
+    """Write what was run and what came of it as `result.json` in the working folder."""
+    took_s = seconds_of(work, steps)
+    result = {
+        "experiment": experiment.name,
+        "size": size,
+        "finished_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        "machine": {"platform": platform.platform(), "cpus": os.cpu_count(), "python": platform.python_version()},
+        "versions": {name: metadata.version(name) for name in ("posecore", "synthgen", "refinenet", "evalkit")},
+        "inputs": {name: None if path is None else path.name for name, path in asdict(inputs).items()},
+        "steps": [
+            {"name": step.name, "command": typed(step, work, step.command), "seconds": took_s.get(step.name)}
+            for step in steps
+        ],
+        "training_seconds": {step.name: took_s.get(step.name) for step in steps if step.run is not None},
+        "paper": dict(experiment.paper),
+        "methods": reported(work / "report" / "summary.json"),
+        **experiment.measured(work),
+    }
+    path = work / "result.json"
+    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    return path
+
+
+def reported(summary: Path) -> dict[str, dict[str, Any]]:
+    """The scores of every result file of a report, by its name."""
+    files = json.loads(summary.read_text(encoding="utf-8"))["files"]
+    return {file["name"]: {key: file["total"][key] for key in SCORES} for file in files}
+
+
+def median_ms(results: Path) -> float:
+    """Median time of one image's poses in a result file, milliseconds."""
+    taken_s = {(line.scene_id, line.im_id): line.time_s for line in read_results(results)}
+    return round(1e3 * statistics.median(taken_s.values()), 2)
+
+
+def main(experiment: Experiment) -> None:
+    """Run an experiment as a script does."""
+    sys.exit(run(experiment))
