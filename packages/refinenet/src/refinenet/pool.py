@@ -20,9 +20,10 @@ KEPT_SHARE = 0.25
 class PooledRefiner:
     """Refines the best of a pool of hypotheses around each start pose: a `PoseRefiner`.
 
-    A pool is the start pose and poses drawn around it, as far as the network's training hypotheses were from the truth.
-    It is ranked as it is, its best quarter is refined, and the most confident result is returned. With `none` nothing
-    is ranked and all of it is refined. Draws depend on the seed and the start pose alone.
+    A pool is the start pose and poses drawn around it, turned and moved across the image by as much as the network was
+    trained to correct; their depth is the start's, which edges hardly show. It is ranked as it is, its best quarter is
+    refined, and the most confident result is returned. With `none` nothing is ranked and all of it is refined. Draws
+    depend on the seed and the start pose alone.
 
     Args:
         refiner: Network; closed with this.
@@ -76,6 +77,8 @@ class PooledRefiner:
         config = self._refiner.checkpoint.provenance.config.hypothesis
         diameter_m = self._refiner.meshes[request.obj_id].diameter_m
         drawn = [draw_hypothesis(pose, diameter_m, config, rng) for _ in range(self._hypotheses - 1)]
+        for T in drawn:
+            T[:3, 3] *= pose[2, 3] / T[2, 3]  # along its ray, back to the start's depth
         return [request, *(Request(obj_id=request.obj_id, T_cam_obj=T) for T in drawn)]
 
     def _best(
