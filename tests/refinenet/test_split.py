@@ -1,0 +1,180 @@
+"""Growing and damaged datasets: what is trained on, and that every process and every resumed run agrees on it."""
+
+import itertools
+import json
+import logging
+import shutil
+import threading
+import time
+
+import fsspec
+import numpy as np
+import pytest
+import torch
+from posecore.errors import ShardError
+from posecore.files import write_atomic
+from posecore.shard import ShardReader
+from refinenet.data import PairStream, make_loader
+from refinenet.split import DataRecord, Growth, divide, read_scenes, split_by_scene
+from refinenet.train import train
+from refinenet.trainer import Trainer
+
+from .test_data import assert_equal, make_stream, take
+from .test_train import small
+
+HELD_OUT = (0, 5)
+
+
+@pytest.fixture
+def growing(dataset, tmp_path):
+    """A copy with its first two shards in the manifest, and a function that adds the next ones."""
+    copy = shutil.copytree(dataset, tmp_path / "growing")
+    manifest = copy / "manifest.jsonl"
+    lines = manifest.read_text().splitlines(keepends=True)
+
+    def reveal(n):
+        write_atomic(manifest, "".join(lines[:n]).encode())
+
+    reveal(2)
+    return copy, reveal
+
+
+@pytest.fixture
+def damaged(dataset, tmp_path):
+    """A copy of which shard 2 is truncated and shard 3 has a flipped byte."""
+    copy = shutil.copytree(dataset, tmp_path / "damaged")
+    cut, flipped = (copy / f"scene_rgb/c/{shard}/0/0/0" for shard in (2, 3))
+    cut.write_bytes(cut.read_bytes()[:-100])
+    content = bytearray(flipped.read_bytes())
+    content[len(content) // 2] ^= 1
+    flipped.write_bytes(content)
+    return copy
+
+
+def follow(url, out, start=0):
+    scene_of, _ = read_scenes(ShardReader(str(url)), [0, 1])
+    record = DataRecord(shards=(0, 1), held_out=HELD_OUT)
+    growth = Growth(out=out, record=record)
+    return make_stream(url, divide(scene_of, HELD_OUT)[0], ["hypothesis.fresh=false"], start=start, growth=growth)
+
+
+def test_new_shards_join_between_epochs_and_held_out_scenes_stay_out(growing, tmp_path):
+    url, reveal = growing
+    stream = follow(url, tmp_path)
+    seen = (set(rows) for _, rows in stream._epochs())
+    assert next(seen) == {0, 1}
+    reveal(4)
+    assert next(seen) == {0, 1, 2, 3}
+    assert next(seen) == {0, 1, 2, 3}
+    reveal(6)
+    assert next(seen) == next(seen) == {0, 1, 2, 3, 4, 5}
+    last = json.loads(max((tmp_path / "growth").iterdir()).read_text())
+    assert last == {"shards": [4, 5], "complete": True}
+    reader = ShardReader(str(url))
+    for group in itertools.islice(stream.groups(0), 30):
+        for _, shard, row in group:
+            assert reader.read(shard, ["scene_index"])["scene_index"][row] not in HELD_OUT
+
+
+def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path):
+    url, reveal = growing
+    first = iter(follow(url, tmp_path))
+    batches = list(itertools.islice(first, 5))
+    reveal(3)
+    batches += itertools.islice(first, 10)
+    reveal(6)  # too late for the epochs that have begun: what another process, or this run again, must not see there
+    assert_equal(batches, take(follow(url, tmp_path), 15))
+    assert_equal(batches[7:], take(follow(url, tmp_path, start=7), 8))
+    ids = torch.cat([batch.sample_ids for batch in batches])
+    assert set(ids[:, 0].tolist()) == {0, 1, 2}
+
+
+def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, monkeypatch, caplog):
+    url, reveal = growing
+    reveal(0)
+    monkeypatch.setattr("refinenet.trainer.FOLLOW_POLL_S", 0.05)
+
+    def render():
+        for n in range(1, 7):
+            time.sleep(0.3)
+            reveal(n)
+
+    rendering = threading.Thread(target=render)
+    rendering.start()
+    with caplog.at_level(logging.WARNING):
+        train(small("loader.follow=true", "steps=30", "batch=4"), str(url), tmp_path / "run")
+    rendering.join()
+    assert "0 shards, waiting for 1" in caplog.text
+    joined = [json.loads(path.read_text())["shards"] for path in sorted((tmp_path / "run/growth").iterdir())]
+    assert any(joined)
+    held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
+    # Killed and resumed when the dataset is complete: the epochs that have begun stay what they were.
+    before = [path.read_text() for path in sorted((tmp_path / "run/growth").iterdir())]
+    train(small("loader.follow=true", "steps=34", "batch=4"), str(url), tmp_path / "run", resume=True)
+    assert [path.read_text() for path in sorted((tmp_path / "run/growth").iterdir())][: len(before)] == before
+    assert json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"] == held_out
+
+
+def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):
+    options = ["batch=4", "steps=16", "loader.shuffle_shards=3"]
+    with pytest.raises(ShardError, match=r"scene_rgb/c/[23]/0/0/0: .*the shard is damaged"):
+        train(small(*options), str(damaged), tmp_path / "strict")
+    with caplog.at_level(logging.WARNING):
+        train(small(*options, "loader.skip_bad_shards=true"), str(damaged), tmp_path / "run")
+    for shard in (2, 3):
+        assert caplog.text.count(f"scene_rgb/c/{shard}/0/0/0") == 1
+    assert "2 damaged shards were skipped" in caplog.text
+    lines = [json.loads(line) for line in (tmp_path / "run/metrics.jsonl").read_text().splitlines()]
+    assert [line["skipped_shards"] for line in lines if "skipped_shards" in line][-1] == 2
+
+
+@pytest.mark.parametrize("group", [1, 3])
+def test_others_stand_in_for_damaged_shards_and_the_stream_still_resumes(dataset, damaged, group):
+    options = ["loader.skip_bad_shards=true", f"loader.shuffle_shards={group}", "hypothesis.fresh=false"]
+    split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
+    whole = take(make_stream(dataset, split, options), 20)
+    mended = take(make_stream(damaged, split, options), 20)
+    for batch, original in zip(mended, whole, strict=True):
+        good = ~torch.isin(original.sample_ids[:, 0], torch.tensor([2, 3]))
+        assert torch.equal(batch.sample_ids[good], original.sample_ids[good])
+        assert not torch.isin(batch.sample_ids[:, 0], torch.tensor([2, 3])).any()
+        assert all(row in split.rows[shard] for shard, row in batch.sample_ids.tolist())
+    assert sum(len(batch.skipped) for batch in mended) == 2
+    resumed = take(make_stream(damaged, split, options, start=11), 9)
+    assert_equal(mended[11:], resumed)
+
+
+def test_a_dataset_without_a_readable_shard_is_an_error(damaged, dataset):
+    split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
+    for path in (damaged / "scene_rgb/c").rglob("0"):
+        if path.is_file():
+            path.write_bytes(b"")
+    with pytest.raises(ShardError, match="none of its shards can be read"):
+        take(make_stream(damaged, split, ["loader.skip_bad_shards=true"]), 1)
+
+
+def test_a_shard_without_scenes_is_left_out_from_the_start(dataset, tmp_path):
+    copy = shutil.copytree(dataset, tmp_path / "copy")
+    (copy / "scene_index/c/4").unlink()
+    with pytest.raises(ShardError, match="scene_index/c/4: found no file"):
+        Trainer(small(), str(copy), tmp_path / "strict")
+    run = Trainer(small("loader.skip_bad_shards=true"), str(copy), tmp_path / "run")
+    assert 4 not in run.training.rows
+    assert len(run.skipped) == 1
+    assert np.array_equal(DataRecord.load(tmp_path / "run").shards, [0, 1, 2, 3, 5])
+
+
+def test_urls_stream_what_a_folder_does(dataset):
+    split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
+    here = take(make_stream(dataset, split), 3)
+    memory = fsspec.filesystem("memory")
+    memory.put(str(dataset), "/pairs", recursive=True)
+    assert_equal(here, take(make_stream("memory://pairs", split), 3))
+    memory.rm("/pairs", recursive=True)
+
+
+@pytest.mark.slow
+def test_a_url_is_read_by_loader_processes(dataset):
+    split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
+    stream: PairStream = make_stream(f"file://{dataset}", split, ["loader.workers=1"])
+    assert_equal(take(make_stream(dataset, split), 3), take(make_loader(stream), 3))
