@@ -14,12 +14,13 @@ from pathlib import Path
 from typing import Any
 
 from posecore.bop import read_results
+from refinenet.methods import BASELINES
 
 from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, shown, typed, words
 
 TUG, BOBBIN = (ROOT / "examples" / "objects" / f"{name}.ply" for name in ("tug", "bobbin"))
 SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
-BASELINES: tuple[str, ...] = ()
+NEED_DEPTH = ("depth-icp",)
 SCORES = (
     "expected", "missing", "vss_mean", "re_sym_deg_mean", "re_sym_deg_median", "tx_mm_mean", "ty_mm_mean", "tz_mm_mean",
     "add_s_recall_0.1d",
@@ -109,31 +110,33 @@ class Comparison:
         objects: Options of `synthgen` that name the meshes.
         each: Meshes with a network of their own by object id; empty where one network serves all objects.
         scenes: Options of `synthgen` for both training pairs and test images.
-        pairs: Training pairs of one network.
-        frames: Test images.
+        pairs: Training pairs of one network, where one is trained.
+        frames: Rendered test images.
         networks: By the name in the report.
         baselines: Methods without a network.
         starts: Options of `evalkit perturb`.
         iterations: Most updates of a pose.
         dataset: Real test images, instead of rendered ones.
         init: Start poses for them, instead of perturbed ones.
-        by: Rows of the paper's tables.
         workers: Processes that render.
+        refine: Further options of `refinenet refine` with a network.
+        tested: Options of `synthgen` that name the meshes in test images, where those are others.
     """
 
     objects: str
     each: Mapping[int, str] = field(default_factory=dict)
     scenes: str
-    pairs: int
-    frames: int
+    pairs: int = 0
+    frames: int = 0
     networks: Mapping[str, Network]
-    baselines: tuple[str, ...] = BASELINES
+    baselines: tuple[str, ...] = tuple(BASELINES)
     starts: str = ""
     iterations: int = 5
     dataset: Path | None = None
     init: Path | None = None
-    by: str = "object"
     workers: int = 2
+    refine: str = ""
+    tested: str | None = None
 
 
 def compared(work: Path, what: Comparison) -> list[Step]:
@@ -143,13 +146,15 @@ def compared(work: Path, what: Comparison) -> list[Step]:
     init = f"{folder}/results/start.csv" if what.init is None else quoted(what.init)
     steps = [*trainings(work, what)]
     if what.dataset is None:
-        steps.append(rendered_frames(work, what.objects, f"{what.scenes} --workers {what.workers}", what.frames))
+        steps.append(
+            rendered_frames(work, what.tested or what.objects, f"{what.scenes} --workers {what.workers}", what.frames)
+        )
     if what.init is None:
         steps.append(start_poses(work, what.starts))
     refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations}"
     results = []
     for name, network in what.networks.items():
-        steps += refinements(work, what, refine, name, network)
+        steps += refinements(work, what, f"{refine} {what.refine}", name, network)
         results.append(name)
     for name in what.baselines:
         steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))

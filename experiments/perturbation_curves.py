@@ -1,10 +1,10 @@
 """How far from the truth may a start be? Convergence from rotated and from moved starts.
 
-Protocol (section 4.1 and figure 4 of the paper, on LINEMOD): every true pose is rotated by 5 to 45 degrees, or moved by
-0 to 1 diameters, and refined in 10 iterations; the curves are shares of poses within error bounds, and of poses that
-diverged (more than 45 degrees or half a diameter away at the end). The paper: benchvise at 45 degrees ends under 5
-degrees in more than 60 % of cases and under 10 degrees in more than 80 %, less than 1 % diverge; the ape ends under 10
-degrees in about half of them.
+Protocol (section 4.1 and figure 4 of the paper, on LINEMOD): every true pose is rotated by 5 to 45 degrees, or moved
+by 0 to 1 diameters, and refined in 10 iterations; the curves are shares of poses within error bounds, and of poses
+that diverged (more than 45 degrees or half a diameter away at the end). The paper: benchvise at 45 degrees ends under
+5 degrees in more than 60 % of cases and under 10 degrees in more than 80 %, less than 1 % diverge; the ape ends under
+10 degrees in about half of them.
 
 Here test images are rendered, scenes that no network was trained on.
 
@@ -63,7 +63,6 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
         Comparison(
             objects=f"--object {quoted(TUG)}",
             scenes=f"--preset quickstart --engine raster {inputs.behind()}",
-            pairs=0,
             frames=FRAMES[size],
             networks={"shipped": Network(checkpoint=SHIPPED)},
             starts="--protocol paper",

@@ -1,0 +1,174 @@
+"""Experiments: every command line is one that its command takes, and one experiment runs from end to end."""
+
+import importlib
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+import pytest
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from experiments import common, cups, join
+from experiments.chain import ROOT
+
+NAMES = [
+    "perturbation_curves",
+    "detection_refinement",
+    "lmo_add",
+    "loss_ablation",
+    "category_level",
+    "speed",
+]
+SIZES = ["smoke", "small", "full"]
+GROUPS = {
+    "synthgen": "synthgen.cli:main",
+    "refinenet": "refinenet.cli:main",
+    "evalkit": "evalkit.cli:main",
+}
+SCRIPTS = {"cups.py": cups.parser, "join.py": join.parser}
+
+
+def experiment(name: str) -> common.Experiment:
+    return importlib.import_module(f"experiments.{name}").EXPERIMENT
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> common.Inputs:
+    """Folders of the layout that experiments expect, with nothing in their files."""
+    data = tmp_path / "lm o"
+    (data / "models").mkdir(parents=True)
+    for name in ("models/models_info.json", "models/obj_000001.ply", "models/obj_000005.ply", "init_x.csv"):
+        (data / name).touch()
+    (tmp_path / "stem.safetensors").touch()
+    return common.Inputs(data=data, backbone_weights=tmp_path / "stem.safetensors", backgrounds=data)
+
+
+def command_of(words: list[str]) -> tuple[click.Command, list[str]]:
+    """The command that a line calls, and its arguments."""
+    module, name = GROUPS[words[0]].split(":")
+    group = getattr(importlib.import_module(module), name)
+    found = group.get_command(click.Context(group), words[1])
+    assert found is not None, f"{words[0]} has no command {words[1]}"
+    return found, words[2:]
+
+
+def parsed(command: click.Command, arguments: list[str]) -> dict:
+    """Values as the command would get them; that files exist is not asked.
+
+    Raises:
+        click.UsageError: An unknown option, a missing one, or a value of the wrong type.
+    """
+    context = click.Context(command)
+    values, rest, _ = command.make_parser(context).parse_args(list(arguments))
+    assert not rest, f"left over: {rest}"
+    for option in command.get_params(context):
+        given, _ = option.consume_value(context, values)
+        if isinstance(option.type, click.Path):
+            assert given or not option.required, f"{option.name} is missing"
+        else:
+            values[option.name] = option.process_value(context, given)
+    return values
+
+
+def check_settings(program: str, values: dict) -> None:
+    """Every preset and every `--set` is one that the program's configuration knows."""
+    if "preset" in values and "overrides" in values:
+        loader = importlib.import_module(f"{program}.config").load_config
+        loader(values["preset"], values["overrides"])
+
+
+def check_line(words: list[str]) -> None:
+    if words[0] == "python":
+        SCRIPTS[Path(words[1]).name]().parse_args(words[2:])
+        return
+    command, arguments = command_of(words)
+    check_settings(words[0], parsed(command, arguments))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", NAMES)
+def test_every_command_line_is_one_that_its_command_takes(name, size, inputs, tmp_path) -> None:
+    steps = experiment(name).plan(tmp_path / "a b", size, inputs)
+    assert len({step.name for step in steps}) == len(steps)
+    assert steps[-1].command[:2] == ("evalkit", "report")
+    for step in steps:
+        check_line(list(step.command))
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("name", NAMES)
+def test_what_a_step_reads_was_made_before(name, size, inputs, tmp_path) -> None:
+    work, made = tmp_path / "a b", set()
+    for step in experiment(name).plan(work, size, inputs):
+        words = list(step.command)
+        outs = {words[place + 1] for place, word in enumerate(words) if word == "--out"}
+        read = {word for word in words if word.startswith(str(work))} - outs
+        if words[0] != "python" or "cups.py" not in words[1]:
+            assert all(any(Path(word).is_relative_to(place) for place in made) for word in read), step.command
+        made |= outs | {str(work / step.leaves)} | (read if words[0] == "python" else set())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_training_and_test_scenes_differ(name, inputs, tmp_path) -> None:
+    for size in SIZES:
+        seeds = {"render": set(), "bop": set()}
+        for step in experiment(name).plan(tmp_path, size, inputs):
+            if step.command[0] == "synthgen":
+                seeds[step.command[1]].add(step.command[step.command.index("--seed") + 1])
+        assert not seeds["render"] & seeds["bop"]
+
+
+def test_a_wrong_line_is_found(tmp_path) -> None:
+    mesh = ["synthgen", "render", "--object", "a.ply", "--out", "b", "--n"]
+    check_line([*mesh, "3"])
+    for wrong in ([*mesh, "none"], [*mesh, "3", "--no-such", "1"], mesh[:-1]):
+        with pytest.raises(click.UsageError):
+            check_line(wrong)
+    with pytest.raises(Exception, match="no_such"):
+        check_line([*mesh, "3", "--set", "window.no_such=1"])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_and_list_run_nothing(name, inputs, tmp_path) -> None:
+    script = [sys.executable, str(ROOT / "experiments" / f"{name}.py")]
+    shown = subprocess.run([*script, "--help"], capture_output=True, text=True, timeout=60)
+    assert shown.returncode == 0, shown.stderr
+    assert "Protocol" in shown.stdout and all(f"--{size}" in shown.stdout for size in SIZES)
+    work = tmp_path / "work"
+    listed = subprocess.run(
+        [*script, str(work), "--smoke", "--list", "--data", str(inputs.data)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert listed.returncode == 0, listed.stderr
+    lines = [shlex.split(line) for line in listed.stdout.splitlines()]
+    assert lines == [
+        list(step.command) for step in experiment(name).plan(work, "smoke", common.Inputs(data=inputs.data))
+    ]
+    assert not work.exists()
+
+
+def test_meshes_that_are_missing_are_said(tmp_path) -> None:
+    with pytest.raises(SystemExit, match="expected --data"):
+        experiment("lmo_add").plan(tmp_path, "small", common.Inputs())
+    with pytest.raises(SystemExit, match="no LM-O meshes"):
+        experiment("perturbation_curves").plan(tmp_path, "full", common.Inputs(data=tmp_path))
+
+
+@pytest.mark.slow
+def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
+    script = ROOT / "experiments" / "perturbation_curves.py"
+    command = [sys.executable, str(script), str(tmp_path / "work"), "--smoke"]
+    first = subprocess.run(command, capture_output=True, text=True, timeout=280)
+    assert first.returncode == 0, first.stdout + first.stderr
+    result = json.loads((tmp_path / "work" / "result.json").read_text())
+    assert (tmp_path / "work" / "report" / "index.html").is_file()
+    assert set(result["methods"]) == {"start", "shipped", *common.BASELINES}
+    assert result["methods"]["start"]["vss_mean"] < result["methods"]["shipped"]["vss_mean"]
+    levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
+    assert levels[-1] == 45
+    assert all(step["seconds"] > 0 for step in result["steps"])
