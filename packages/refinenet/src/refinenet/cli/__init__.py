@@ -4,6 +4,7 @@ import click
 
 from refinenet.cli.group import CleanGroup
 from refinenet.cli.refine import refine
+from refinenet.cli.track import track
 from refinenet.cli.train import train
 
 _CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
@@ -17,8 +18,10 @@ def main() -> None:
     \b
     refinenet train shards/
     refinenet refine --checkpoint runs/compact/best.safetensors --dataset lmo --init start.csv --out refined.csv
+    refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
+        --out track.csv
     """
 
 
-for _command in (refine, train):
+for _command in (refine, track, train):
     main.add_command(_command)

@@ -1,0 +1,238 @@
+"""`refinenet track`."""
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from posecore.errors import ConfigError
+
+from refinenet.cli.console import progress_bar, start_logging
+from refinenet.cli.options import (
+    FILE,
+    NEW_FILE,
+    device_option,
+    iterations_option,
+    other_mesh_option,
+    quiet_option,
+    threads_option,
+    verbose_option,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from posecore.bop import ModelInfo
+    from posecore.mesh import Mesh
+
+    from refinenet.checkpoint import Checkpoint
+    from refinenet.sequence import FrameSequence
+
+
+@click.command()
+@click.argument("source", type=FILE)
+@click.option("--checkpoint", required=True, type=FILE, metavar="FILE", help="Trained network (.safetensors).")
+@click.option("--out", required=True, type=NEW_FILE, metavar="CSV", help="Poses, a BOP result file.")
+@click.option("--init", type=FILE, metavar="CSV", help="BOP result file to start from, and to start again when lost.")
+@click.option(
+    "--pose", type=FILE, metavar="JSON", help="Start poses as a list of scene_gt.json: obj_id, cam_R_m2c, ..."
+)
+@click.option("--split", metavar="NAME", help="Split of a BOP dataset. [test, val, train_pbr, train or the only one]")
+@click.option(
+    "--scene", type=click.IntRange(0), help="Scene of a BOP dataset; of images in the result file. [only one, 0]"
+)
+@click.option("--camera", type=FILE, metavar="JSON", help="Camera of images or a video: a BOP camera.json.")
+@click.option(
+    "--mesh", "mesh_files", type=FILE, multiple=True, metavar="FILE",
+    help="Mesh (mm) for images or a video; obj_000005.ply is object 5, else the checkpoint's only one. Repeatable.",
+)  # fmt: skip
+@click.option("--object", "objects", type=int, multiple=True, help="Track only this object. Repeatable. [all]")
+@iterations_option
+@click.option("--motion-model", is_flag=True, help="Expect constant velocity, not the place of the last frame.")
+@click.option("--sure", type=click.FloatRange(0, 1), help="Confidence of a pose that fits. [0.65, learned 0.5]")
+@click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.5, learned 0.2]")
+@click.option("--patience", type=click.IntRange(1), default=5, help="Frames without a pose until an object is lost.")
+@click.option(
+    "--depth-step", type=click.FloatRange(0, 0.5, max_open=True), default=0.02,
+    help="Also try each pose nearer and farther by this share of its depth; 0 is faster, and depth may drift.",
+)  # fmt: skip
+@click.option("--video", type=NEW_FILE, metavar="FILE", help="Write a video (.mp4, .avi) with contours and states.")
+@click.option("--fps", type=click.FloatRange(0.1), default=30.0, help="Frames a second of --video.")
+@click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
+@device_option
+@threads_option
+@other_mesh_option
+@quiet_option
+@verbose_option
+def track(
+    source: Path,
+    checkpoint: Path,
+    out: Path,
+    init: Path | None,
+    pose: Path | None,
+    split: str | None,
+    scene: int | None,
+    camera: Path | None,
+    mesh_files: tuple[Path, ...],
+    objects: tuple[int, ...],
+    iterations: int,
+    motion_model: bool,
+    sure: float | None,
+    found: float | None,
+    patience: int,
+    depth_step: float,
+    video: Path | None,
+    fps: float,
+    name: str | None,
+    device: str,
+    threads: int,
+    allow_other_mesh: bool,
+    quiet: bool,
+    verbose: bool,
+) -> None:
+    """Track objects through SOURCE: a scene of a BOP dataset, a folder of images, or a video file.
+
+    Each frame starts from the poses of the one before. An object is tracking, uncertain, or lost; one that is lost has
+    no pose in the result file until one of --init or --pose fits, or it is found again where it was.
+
+    \b
+    refinenet track choi --scene 1 --checkpoint best.safetensors --init start.csv --out results/track.csv
+    refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
+        --out track.csv --video annotated.mp4
+    """
+    start_logging(verbose)
+    if (init is None) == (pose is None):
+        raise click.UsageError("give either --init or --pose: where the objects are at the start")
+    import torch
+    from posecore.bop import write_results
+
+    from refinenet import __version__
+    from refinenet import checkpoint as checkpoints
+    from refinenet.refine import Refiner
+    from refinenet.sequence import BopScene, open_sequence
+    from refinenet.track import TrackLog, track_sequence
+    from refinenet.tracker import Tracker
+    from refinenet.tracking import GRADIENT_TRACKING, LEARNED_TRACKING, TrackingConfig
+
+    if threads:
+        torch.set_num_threads(threads)
+    loaded = checkpoints.load(checkpoint)
+    sequence = open_sequence(source, split=split, scene=scene, camera=camera)
+    starts = _Starts(init, pose, sequence, objects)
+    meshes, infos = _models(sequence, mesh_files, loaded, starts.obj_ids)
+    log, stopped = TrackLog(), False
+    with Refiner(
+        loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh
+    ) as refiner, progress_bar(quiet) as bar:  # fmt: skip
+        usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
+        config = TrackingConfig(
+            sure=usual.sure if sure is None else sure,
+            found=usual.found if found is None else found,
+            patience=patience,
+            depth_step=depth_step,
+        )
+        symmetries = {i: info for i, info in infos.items() if info.is_symmetric}
+        tracker = Tracker(refiner, starts.obj_ids, config, symmetries=symmetries, motion=motion_model)
+        task = bar.add_task("frames", total=len(sequence) or None)
+        try:
+            track_sequence(
+                sequence, tracker, starts.offered, log, meshes=meshes, video=video, fps=fps,
+                on_frame=lambda: bar.advance(task),
+            )  # fmt: skip
+        except KeyboardInterrupt:
+            stopped = True
+        sidecar: dict[str, Any] = {"method": name or f"{refiner.name}, tracking"}
+        if isinstance(sequence, BopScene):
+            sidecar |= {"dataset": str(sequence.dataset.root.resolve()), "split": sequence.dataset.split}
+        sidecar |= {
+            "checkpoint": loaded.path.name,
+            "checkpoint_sha256": loaded.sha256,
+            "settings": {
+                "refinenet": __version__, **refiner.settings, "motion_model": motion_model, "sure": config.sure,
+                "found": config.found, "patience_frames": config.patience, "depth_step": config.depth_step,
+            },
+            "init": (init or pose or source).name,
+            "states": {str(state): count for state, count in log.states.items()},
+            "resets": log.resets,
+            "misses": log.misses,
+        }  # fmt: skip
+    write_results(out, log.estimates, sidecar)
+    counts = ", ".join(f"{count} {state}" for state, count in log.states.items())
+    click.echo(f"{out}: {log.frames} frames, {counts}; {len(log.resets)} starts from a given pose")
+    if log.frames:
+        click.echo(
+            f"{log.frames / log.tracking_s:.1f} frames/s tracking, "
+            f"{log.frames / log.total_s:.1f} with reading{' and drawing' if video else ''}"
+        )
+    if stopped:
+        click.echo(f"Stopped; what was tracked is in {out}", err=True)
+        raise SystemExit(130)
+
+
+class _Starts:
+    """Start poses of a sequence: those of a result file at their images, those of a pose file at any."""
+
+    def __init__(
+        self, init: Path | None, pose: Path | None, sequence: "FrameSequence", objects: tuple[int, ...]
+    ) -> None:
+        from posecore.bop import read_results
+
+        self._always: dict[int, list[np.ndarray]] = {}
+        self._at: dict[int, dict[int, list[np.ndarray]]] = {}
+        if init is not None:
+            for start in read_results(init):
+                if start.scene_id == sequence.scene_id and (not objects or start.obj_id in objects):
+                    self._at.setdefault(start.im_id, {}).setdefault(start.obj_id, []).append(start.T_cam_obj)
+        elif pose is not None:
+            for obj_id, T in _read_poses(pose):
+                if not objects or obj_id in objects:
+                    self._always.setdefault(obj_id, []).append(T)
+        self.obj_ids = sorted({i for known in (self._always, *self._at.values()) for i in known})
+        if not self.obj_ids:
+            which = f" of object {', '.join(map(str, objects))}" if objects else ""
+            raise ConfigError(
+                f"{init or pose}: no pose{which} for scene {sequence.scene_id}; change --scene or --object"
+            )
+
+    def offered(self, number: int) -> "dict[int, list[np.ndarray]]":
+        """Poses for a frame, by object."""
+        return self._at.get(number, {}) if self._at else self._always
+
+
+def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
+    from posecore.bop.annotations import ground_truth
+    from posecore.bop.jsonfile import read_json
+
+    poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
+    return [(pose.obj_id, pose.T_cam_obj) for pose in poses]
+
+
+def _models(
+    sequence: "FrameSequence", files: tuple[Path, ...], loaded: "Checkpoint", obj_ids: list[int]
+) -> "tuple[dict[int, Mesh], dict[int, ModelInfo]]":
+    """Meshes and symmetries of the objects: the dataset's, or files with a models_info.json beside them."""
+    from posecore.bop import load_models_info
+    from posecore.mesh import load_mesh
+
+    from refinenet.sequence import BopScene
+
+    if isinstance(sequence, BopScene):
+        if files:
+            raise ConfigError("--mesh is for images and videos; a BOP dataset brings its own models")
+        infos = sequence.dataset.models_info
+        return {i: sequence.dataset.mesh(i) for i in obj_ids}, {i: infos[i] for i in obj_ids if i in infos}
+    trained = sorted(map(int, loaded.provenance.objects))
+    meshes, symmetric = {}, {}
+    for file in files:
+        numbered = re.fullmatch(r"obj_(\d+)", file.stem)
+        if numbered is None and len(trained) > 1:
+            some = ", ".join(map(str, trained))
+            raise ConfigError(f"{file}: the checkpoint knows objects {some}; name the file obj_000001.ply to say which")
+        obj_id = int(numbered[1]) if numbered else trained[0]
+        meshes[obj_id] = load_mesh(file, units="mm")
+        info_file = file.with_name("models_info.json")
+        if info_file.is_file():
+            symmetric |= {i: info for i, info in load_models_info(info_file).items() if i == obj_id}
+    missing = [i for i in obj_ids if i not in meshes]
+    if missing:
+        raise ConfigError(f"object {missing[0]} has a start pose and no mesh; give its file with --mesh")
+    return {i: meshes[i] for i in obj_ids}, symmetric
