@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from evalkit import silhouette
+from evalkit.curves import by_level
 from evalkit.evaluate import Evaluator
 from evalkit.files import ResultFile, load_result_files
 from evalkit.metrics import vss
 from evalkit.pairing import Pair, pair_up
 from evalkit.scored import Scored
-from evalkit.scores import by_level, by_object, scores
+from evalkit.scores import by_object, scores
 from evalkit.silhouette import Patch, View
 from evalkit.summary import start_of
 from evalkit.table import column, table_of
