@@ -6,7 +6,7 @@ import os
 import platform
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib import metadata
@@ -140,7 +140,7 @@ class Comparison:
 
 
 def compared(work: Path, what: Comparison) -> list[Step]:
-    """The chain of a comparison: pairs, networks, test images, start poses, every method's poses, report, tables."""
+    """The chain of a comparison: pairs, networks, test images, start poses, every method's poses, tables, report."""
     folder = quoted(work)
     dataset = f"{folder}/test_bop" if what.dataset is None else quoted(what.dataset)
     init = f"{folder}/results/start.csv" if what.init is None else quoted(what.init)
@@ -160,6 +160,16 @@ def compared(work: Path, what: Comparison) -> list[Step]:
         steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))
         results.append(name)
     named = " ".join(f"--results {path}" for path in [init, *(f"{folder}/results/{name}.csv" for name in results)])
+    steps.append(
+        Step(
+            name="tables",
+            why="The paper's tables of them.",
+            command=words(
+                f"evalkit tables --dataset {dataset} {named} --out {folder}/tables.md --out {folder}/tables.json"
+            ),
+            leaves="tables.json",
+        )
+    )
     steps.append(report(work, f"--dataset {dataset} {named}"))
     return steps
 
@@ -231,15 +241,19 @@ def refinements(work: Path, what: Comparison, refine: str, name: str, network: N
         for number, part in zip(what.each, parts, strict=True):
             chosen = f"--object {number} --checkpoint {folder}/run_{part}/best.safetensors"
             yield refinement(work, f"{refine} {chosen}", part, f"Object {number}, refined by its network.", "parts")
-        files = " ".join(f"{folder}/parts/{part}.csv" for part in parts)
-        yield Step(
-            name=f"join-{name}",
-            why=f"All objects of '{name}' in one result file.",
-            command=words(
-                f"python {quoted(ROOT / 'experiments' / 'join.py')} {files} --out {folder}/results/{name}.csv"
-            ),
-            leaves=f"results/{name}.csv",
-        )
+        yield joined(work, name, parts)
+
+
+def joined(work: Path, name: str, parts: Sequence[str]) -> Step:
+    """One result file of a method's parts."""
+    folder = quoted(work)
+    files = " ".join(f"{folder}/parts/{part}.csv" for part in parts)
+    return Step(
+        name=f"join-{name}",
+        why=f"All of '{name}' in one result file.",
+        command=words(f"python {quoted(ROOT / 'experiments' / 'join.py')} {files} --out {folder}/results/{name}.csv"),
+        leaves=f"results/{name}.csv",
+    )
 
 
 def refinement(work: Path, refine: str, name: str, why: str, place: str = "results") -> Step:

@@ -18,26 +18,20 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+SAME = ("dataset", "split", "init", "perturbation", "settings")
+LISTS = ("start_lines", "failed_lines", "resets", "misses")
+
+
 def join(parts: list[Path], out: Path) -> None:
-    """Write all lines of the parts in their order, with the sidecar's common facts and the parts' own beside them."""
+    """Write all lines of the parts in their order; the sidecar has what they have in common, and their lists joined."""
     sidecars = [read_sidecar(part) or {} for part in parts]
-    common = {key: sidecars[0][key] for key in ("dataset", "split", "init") if key in sidecars[0]}
-    estimates = [line for part in parts for line in read_results(part)]
-    write_results(
-        out,
-        estimates,
-        common
-        | {
-            "method": out.stem,
-            "settings": sidecars[0].get("settings", {}),
-            "checkpoints": {
-                part.name: sidecar.get("checkpoint_sha256") for part, sidecar in zip(parts, sidecars, strict=True)
-            },
-            "start_lines": [line for sidecar in sidecars for line in sidecar.get("start_lines", [])],
-            "failed_lines": [line for sidecar in sidecars for line in sidecar.get("failed_lines", [])],
-        }
-        | ({"perturbation": sidecars[0]["perturbation"]} if "perturbation" in sidecars[0] else {}),
-    )
+    sidecar = {key: sidecars[0][key] for key in SAME if key in sidecars[0]}
+    sidecar |= {key: [item for one in sidecars for item in one[key]] for key in LISTS if key in sidecars[0]}
+    sidecar |= {
+        "method": out.stem,
+        "parts": {part.name: one.get("checkpoint_sha256") for part, one in zip(parts, sidecars, strict=True)},
+    }
+    write_results(out, [line for part in parts for line in read_results(part)], sidecar)
 
 
 def main() -> int:

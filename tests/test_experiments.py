@@ -20,6 +20,7 @@ NAMES = [
     "lmo_add",
     "loss_ablation",
     "category_level",
+    "tracking",
     "speed",
 ]
 SIZES = ["smoke", "small", "full"]
