@@ -20,6 +20,8 @@ from refinenet.tracking import (
 )
 
 Array = np.ndarray
+VELOCITY_SIGHTINGS = 5
+"""Velocity is measured over so many frames: between two alone it would be noise, in depth above all."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,8 +62,7 @@ class Track:
     symmetries: Symmetric | None = None
     motion: bool = False
     standing: Standing = field(default_factory=lambda: Standing(state=TrackState.LOST))
-    _before: Sighting | None = None
-    _last: Sighting | None = None
+    _seen: list[Sighting] = field(default_factory=list)
     _own: int = 0
 
     def wanted(self, frame: int, offered: Sequence[Float[Array, "4 4"]]) -> list[Request]:
@@ -70,9 +71,9 @@ class Track:
         A lost track tries the poses offered, and the place where it last was. Others go on from their last pose, with
         the motion model from its prediction; each is tried at a few depths.
         """
-        own = [] if self._last is None else [self._last.T_cam_obj]
-        if self._last is not None and self.motion and self._before is not None:
-            own.insert(0, predicted(self._before, self._last, frame))
+        own = [] if not self._seen else [self._seen[-1].T_cam_obj]
+        if self.motion and len(self._seen) > 1:
+            own.insert(0, predicted(self._seen[0], self._seen[-1], frame))
             if self.standing.state is TrackState.TRACKING:
                 own = own[:1]
         own = [near for T in own for near in at_depths(T, self.config.depth_step)]
@@ -87,17 +88,17 @@ class Track:
             return self._without("there is no pose to start from in this frame", 0.0)
         best = max(range(len(results)), key=lambda i: _confidence(results[i]))
         found, confidence = results[best], _confidence(results[best])
+        gap = self.standing.missed > 0 or self.standing.state is TrackState.LOST
         self.standing = next_standing(self.standing, confidence, self.config)
         if self.standing.state is TrackState.LOST or self.standing.missed:
             return self._without(found.failure or f"the best pose has a confidence of {confidence:.2f}", confidence)
         pose = found.T_cam_obj
-        if self._last is not None and self.symmetries is not None:
-            pose = nearest_copy(pose, self._last.T_cam_obj, self.symmetries)
+        if self._seen and self.symmetries is not None:
+            pose = nearest_copy(pose, self._seen[-1].T_cam_obj, self.symmetries)
         restarted = best >= self._own
         # Across a gap there is no velocity: the way between may have been any.
-        follows = self._last is not None and not restarted and frame - self._last.frame <= self.config.patience
-        self._before = self._last if follows else None
-        self._last = Sighting(frame=frame, T_cam_obj=pose)
+        follows = bool(self._seen) and not restarted and not gap
+        self._seen = [*(self._seen[1 - VELOCITY_SIGHTINGS :] if follows else []), Sighting(frame=frame, T_cam_obj=pose)]
         return Tracked(
             obj_id=self.obj_id, state=self.standing.state, T_cam_obj=pose, confidence=confidence, restarted=restarted
         )

@@ -48,8 +48,8 @@ if TYPE_CHECKING:
 @click.option("--object", "objects", type=int, multiple=True, help="Track only this object. Repeatable. [all]")
 @iterations_option
 @click.option("--motion-model", is_flag=True, help="Expect constant velocity, not the place of the last frame.")
-@click.option("--sure", type=click.FloatRange(0, 1), help="Confidence of a pose that fits. [0.65, learned 0.5]")
-@click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.5, learned 0.2]")
+@click.option("--sure", type=click.FloatRange(0, 1), help="Confidence of a pose that fits. [0.35, learned 0.5]")
+@click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.2]")
 @click.option("--patience", type=click.IntRange(1), default=5, help="Frames without a pose until an object is lost.")
 @click.option(
     "--depth-step", type=click.FloatRange(0, 0.5, max_open=True), default=0.02,
@@ -221,7 +221,8 @@ def _models(
         infos = sequence.dataset.models_info
         return {i: sequence.dataset.mesh(i) for i in obj_ids}, {i: infos[i] for i in obj_ids if i in infos}
     trained = sorted(map(int, loaded.provenance.objects))
-    meshes, symmetric = {}, {}
+    meshes: dict[int, Mesh] = {}
+    symmetric: dict[int, ModelInfo] = {}
     for file in files:
         numbered = re.fullmatch(r"obj_(\d+)", file.stem)
         if numbered is None and len(trained) > 1:

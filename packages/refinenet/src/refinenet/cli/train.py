@@ -16,7 +16,7 @@ from refinenet.cli.options import FILE, quiet_option, verbose_option
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-PRESETS = ("paper", "compact")
+PRESETS = ("paper", "compact", "plus")
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
 
 log = logging.getLogger(__name__)

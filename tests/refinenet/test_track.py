@@ -1,0 +1,150 @@
+"""`refinenet track` through files: a BOP scene, a folder of images, a video."""
+
+import csv
+import json
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from posecore import se3
+from posecore.bop import BopDataset, BopWriter, Estimate, GroundTruth, read_results, read_sidecar, write_models
+from posecore.bop import write_results as write
+from posecore.camera import Camera
+from posecore.mesh import save_ply
+from posecore.raster import Instance, Rasteriser
+from refinenet import checkpoint
+from refinenet.config import load_config
+from refinenet.network import make_network
+
+from .conftest import HEIGHT_PX, WIDTH_PX, K, background
+
+FRAMES, GONE, BACK = 14, range(4, 9), 9
+
+
+@pytest.fixture(scope="module")
+def still(mesh, tmp_path_factory):
+    """A checkpoint whose network leaves poses where they are: its heads are zero."""
+    config = load_config("compact")
+    network = make_network(config.network)
+    for head in (network.rotation, network.translation):
+        torch.nn.init.zeros_(head.weight)
+    path = tmp_path_factory.mktemp("still") / "still.safetensors"
+    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
+    provenance = checkpoint.Provenance(
+        config=config, step=0, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
+    )
+    checkpoint.save(path, network, provenance)
+    return path
+
+
+@pytest.fixture(scope="module")
+def scene(mesh, tmp_path_factory):
+    """A scene in which the object stands, comes nearer by 1 % a frame, is gone, and is back somewhere else."""
+    root = tmp_path_factory.mktemp("scene") / "bop"
+    rng = np.random.default_rng(3)
+    behind = background(rng)
+    first, second = (
+        se3.make_T(se3.random_rotation(rng), np.array([x, 0.01, 6 * mesh.diameter_m])) for x in (-0.08, 0.1)
+    )
+    truths = {}
+    with Rasteriser({1: mesh}) as rasteriser, BopWriter(root, "test", 1) as writer:
+        for frame in range(FRAMES):
+            T = (first if frame < GONE[0] else second).copy()
+            T[:3, 3] *= 1 - 0.01 * min(frame, GONE[0])
+            layers = rasteriser.render_scene([Instance(obj_id=1, T_cam_obj=T)], K, WIDTH_PX, HEIGHT_PX)
+            mask = (layers.instance == 0) & (frame not in GONE)
+            image = np.where(mask[..., None], layers.rgb, behind)
+            camera = Camera(K=K, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+            gt = GroundTruth(obj_id=1, T_cam_obj=T, gt_index=0)
+            writer.add_frame(frame, image, np.where(mask, layers.depth_m, 0), camera, [gt], [mask], [mask])
+            truths[frame] = T
+    write_models(root, {1: mesh}, {})
+    starts = [Estimate(scene_id=1, im_id=i, obj_id=1, T_cam_obj=truths[i]) for i in (0, 2, BACK)]
+    write(root / "start.csv", starts)
+    camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDTH_PX, "height": HEIGHT_PX}
+    (root / "cam.json").write_text(json.dumps(camera))
+    entry = {
+        "obj_id": 1,
+        "cam_R_m2c": truths[0][:3, :3].ravel().tolist(),
+        "cam_t_m2c": (1e3 * truths[0][:3, 3]).tolist(),
+    }
+    (root / "pose.json").write_text(json.dumps([entry]))
+    return root, truths
+
+
+def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
+    root, truths = scene
+    out, video = tmp_path / "track.csv", tmp_path / "track.mp4"
+    result = cli(
+        "track", root, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--video", video,
+        "--patience", 3, "--quiet",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert "14 frames, 9 tracking, 2 uncertain, 3 lost; 2 starts from a given pose" in result.stdout
+    assert "frames/s tracking" in result.stdout
+    found = {estimate.im_id: estimate for estimate in read_results(out, BopDataset(root))}
+    assert sorted(found) == [i for i in range(FRAMES) if i not in GONE]
+    for im_id, estimate in found.items():  # the network moves nothing: it is the depths tried that follow the object
+        assert abs(estimate.T_cam_obj[2, 3] / truths[im_id][2, 3] - 1) < 0.021
+        assert estimate.time_s > 0
+    sidecar = read_sidecar(out)
+    assert sidecar["states"] == {"tracking": 9, "uncertain": 2, "lost": 3}
+    assert sidecar["resets"] == [{"scene_id": 1, "im_id": i, "obj_id": 1} for i in (0, BACK)]
+    assert [miss["im_id"] for miss in sidecar["misses"]] == list(GONE)
+    assert frames_of(video) == FRAMES
+
+
+def frames_of(video):
+    opened, count = cv2.VideoCapture(str(video)), 0
+    while opened.read()[0]:
+        count += 1
+    return count
+
+
+def test_a_folder_and_a_video_give_the_scenes_poses(cli, scene, still, mesh, tmp_path):
+    root, truths = scene
+    folder = shutil.copytree(root / "test" / "000001" / "rgb", tmp_path / "images")
+    writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 30, (WIDTH_PX, HEIGHT_PX))
+    for file in sorted(folder.iterdir()):
+        writer.write(cv2.imread(str(file)))
+    writer.release()
+    save_ply(mesh, tmp_path / "part.ply", units="mm")
+    rest = ["--camera", root / "cam.json", "--mesh", tmp_path / "part.ply", "--pose", root / "pose.json"]
+    for source in (folder, tmp_path / "clip.avi"):
+        out = tmp_path / f"{source.name}.csv"
+        result = cli("track", source, "--checkpoint", still, *rest, "--out", out, "--quiet", "--motion-model")
+        assert result.exit_code == 0, result.output
+        found = {row["im_id"]: row for row in csv.DictReader(out.open())}
+        assert set(found) >= {"0", "1", "2", "3"}
+        assert {row["scene_id"] for row in found.values()} == {"0"}
+        t_mm = np.array(found["3"]["t"].split(), float)
+        np.testing.assert_allclose(t_mm, 1e3 * truths[3][:3, 3], rtol=0.021)
+
+
+def test_track_errors_are_one_line(cli, scene, still, tmp_path):
+    root, _ = scene
+    images = root / "test" / "000001" / "rgb"
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "no.mp4").write_bytes(b"not a video")
+    (tmp_path / "cam.json").write_text('{"fx": 1}')
+    init, pose, camera = ["--init", root / "start.csv"], ["--pose", root / "pose.json"], ["--camera", root / "cam.json"]
+    for arguments, code, text in (
+        ([tmp_path / "none", *init], 1, "no such folder or file"),
+        ([root, *init, "--scene", 7], 1, "no scene 7"),
+        ([root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
+        ([images, *pose], 2, "need --camera"),
+        ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "found no numbers fx, fy, cx, cy"),
+        ([images, *pose, *camera], 2, "object 1 has a start pose and no mesh; give its file with --mesh"),
+        ([tmp_path / "empty", *pose, *camera], 1, "no images"),
+        ([tmp_path / "no.mp4", *pose, *camera], 1, "cannot open it as a video"),
+        ([root, *init, "--sure", 0.2, "--found", 0.4], 2, "expected 0 <= found <= sure"),
+        ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
+    ):
+        result = cli("track", *arguments, "--checkpoint", still, "--out", tmp_path / "x.csv", "--quiet")
+        assert result.exit_code == code, result.output
+        assert text in result.stderr, result.stderr
+        assert "Traceback" not in result.output
+        assert len([line for line in result.stderr.splitlines() if line.startswith("Error: ")]) == 1
+    assert cli("track", root, "--checkpoint", still, "--out", tmp_path / "x.csv").exit_code == 2
