@@ -6,8 +6,9 @@ from posecore.raster import Rasteriser
 from posecore.shard import ShardReader
 from posecore.window import Window, cut
 from refinenet import augment
-from refinenet.config import AugmentConfig, HypothesisConfig, load_config
-from refinenet.hypothesis import PairMaker, draw_hypothesis, optical_axis_turn, recut_affine, warp
+from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig, load_config
+from refinenet.hypothesis import PairMaker, draw_hypothesis
+from refinenet.recut import optical_axis_turn, recut_affine, warp
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,7 @@ def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, **hypothe
         meshes={1: mesh},
         rasteriser=rasteriser,
         patch_px=64,
-        window_scale=1.5,
+        window=WindowConfig(kind="diameter", scale=1.5),
         contour_points=32,
         hypothesis=HypothesisConfig(**hypothesis),
         augment_config=augment_config or AugmentConfig(),
@@ -122,7 +123,7 @@ def test_colour_augmentation_keeps_black_and_moves_both_patches_together():
     hypothesis = np.zeros((6, 16, 16, 3), np.uint8)
     hypothesis[:, 4:12, 4:12] = [200, 100, 20]
     config = AugmentConfig(permute_channels=1.0)
-    scene, render = augment.colour(hypothesis, hypothesis, config, rng)
+    scene, render, _ = augment.colour(hypothesis, hypothesis, config, rng)
     np.testing.assert_array_equal(scene, render)
     assert (render[:, 0, 0] == 0).all()
     assert len(np.unique(render[:, 8, 8], axis=0)) > 1

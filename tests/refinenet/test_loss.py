@@ -159,7 +159,7 @@ def test_outside_the_patch_the_distance_grows_with_the_way_back():
 
 @pytest.mark.parametrize("name", loss.LOSSES)
 def test_gradcheck(mesh, turned, name):
-    few = Target(*(x[:2] for x in turned))
+    few = Target(*(None if x is None else x[:2] for x in turned))
     chosen = loss.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
     generator = torch.manual_seed(0)
     quat = torch.tensor([[1.0, 0.02, 0.03, -0.01]] * 2, dtype=torch.float64).requires_grad_()

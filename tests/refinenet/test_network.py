@@ -160,8 +160,8 @@ def test_training_options_are_checked():
         load_config("compact", ["optimiser.momentum=0.9"])
     with pytest.raises(ConfigError, match=r"patch_px is 64: kind=paper is built for 224"):
         load_config("paper", ["network.patch_px=64"])
-    with pytest.raises(ConfigError, match="unknown preset 'plus'"):
-        load_config("plus")
+    with pytest.raises(ConfigError, match="unknown preset 'minus'"):
+        load_config("minus")
     config = load_config("paper", ["backbone.name=inception_v3", "backbone.pretrained=false", "steps=5"])
     assert (config.network.backbone.name, config.network.backbone.pretrained) == ("inception_v3", False)
     assert replace(config, steps=100_000).optimiser.lr == 3e-4

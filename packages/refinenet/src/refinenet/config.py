@@ -1,4 +1,4 @@
-"""Configuration of training and refinement; the two presets are YAML files beside this module."""
+"""Configuration of training and refinement; the presets are YAML files beside this module."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from typing import Literal
 from posecore import config as posecore_config
 from posecore.errors import ConfigError
 
-PRESETS = ("paper", "compact")
+PRESETS = ("paper", "compact", "plus")
 
 
 def _require(ok: bool, message: str) -> None:
@@ -37,21 +37,30 @@ class NetworkConfig:
     """Architecture.
 
     Attributes:
-        kind: `paper` or `compact`.
+        kind: `paper`, `compact` or `plus`.
         patch_px: side of both input patches.
+        rotation: output of the rotation head, `6d` or `quaternion`; None is the kind's own: `paper`'s is `quaternion`,
+            the others' `6d`.
+        translation: output of the translation head, image-plane shift and depth ratio as the `crop` shows them, or
+            metres in `camera` axes; None is the kind's own: `paper`'s is `camera`, the others' `crop`.
+        confidence: whether a third head tells how well the hypothesis fits.
         backbone: stem of `paper`.
         branch_channels: channels of `paper`'s last strided convolution, before the heads.
-        encoder: channels of the two stages that each of `compact`'s patches goes through, to a quarter of its size.
-        match_channels: length of the features whose dot products `compact` matches.
-        match_radius: how far it matches, in cells of a quarter of the patch's resolution.
-        appearance_channels: channels that tell `compact` what is there, beside what moved.
-        widths: channels of the two layers after matching, at an eighth of the patch's size.
-        hidden: units before `compact`'s heads.
+        encoder: channels of the two stages that each patch goes through, to a quarter of its size; not in `paper`.
+        match_channels: length of the features whose dot products are matched; not in `paper`.
+        match_radius: how far they are matched, in cells of a quarter of the patch's resolution.
+        appearance_channels: channels that tell what is there, beside what moved; not in `paper`.
+        widths: channels of the two layers after matching, at an eighth of the patch's size; `plus` ends with the second
+            at a thirty-second.
+        hidden: units before the heads; not in `paper`.
         head_std: standard deviation of the heads' initial weights.
     """
 
-    kind: Literal["paper", "compact"]
+    kind: Literal["paper", "compact", "plus"]
     patch_px: int
+    rotation: Literal["6d", "quaternion"] | None = None
+    translation: Literal["crop", "camera"] | None = None
+    confidence: bool = False
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
     branch_channels: int = 96
     encoder: tuple[int, int] = (24, 48)
@@ -68,6 +77,10 @@ class NetworkConfig:
             self.kind != "paper" or self.patch_px == 224, f"patch_px is {self.patch_px}: kind=paper is built for 224"
         )
         _require(self.patch_px % 8 == 0, f"patch_px is {self.patch_px}, expected a multiple of 8")
+        _require(
+            self.kind != "plus" or self.patch_px % 32 == 0,
+            f"patch_px is {self.patch_px}, expected a multiple of 32 for kind=plus",
+        )
         _require(1 <= self.match_radius <= 16, f"match_radius is {self.match_radius}, expected 1 to 16 cells")
 
 
@@ -92,7 +105,7 @@ class HypothesisConfig:
     """Hypotheses rendered in the training loop.
 
     Attributes:
-        fresh: draw and render them anew at every pass; otherwise the shards' own pairs are used.
+        fresh: draw and render them anew at every pass; otherwise the shards' own hypotheses are used.
         max_angle_deg: largest rotation; angles are uniform up to it.
         max_translation_diameter: largest move, in object diameters; lengths are uniform up to it.
         easy_share: share of samples whose angle is scaled down at random, and of those whose distance is,
@@ -128,6 +141,8 @@ class AugmentConfig:
         noise: largest standard deviation of the scene's noise, in grey levels.
         blur: probability that the scene is blurred.
         background: probability that everything behind the scene's foreground is exchanged.
+        occlusion: probability that a piece of another scene's foreground is pasted over the object.
+        occlusion_leaves: share of the visible object that a pasted piece leaves at least.
     """
 
     permute_channels: float = 0.0
@@ -138,14 +153,41 @@ class AugmentConfig:
     noise: float = 0.0
     blur: float = 0.0
     background: float = 0.0
+    occlusion: float = 0.0
+    occlusion_leaves: float = 0.35
 
     def __post_init__(self) -> None:
-        for name in ("permute_channels", "blur", "background"):
+        for name in ("permute_channels", "blur", "background", "occlusion", "occlusion_leaves"):
             value = getattr(self, name)
             _require(0 <= value <= 1, f"{name} is {value}, expected a probability")
         for name in ("gain", "scene_gain", "brightness", "contrast"):
             value = getattr(self, name)
             _require(0 <= value < 1, f"{name} is {value}, expected 0 to under 1")
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnPredictionsConfig:
+    """Training on the network's own predictions: what the later iterations of a refinement see.
+
+    Part of each batch starts from where the network itself, as it is at that step, moved the hypothesis. The part grows
+    with the run: a young network's predictions teach little.
+
+    Attributes:
+        share: part of a batch at the end of its growth; 0 trains on drawn hypotheses only.
+        begin: part of the run's steps after which it starts to grow from 0.
+        full: part of the run's steps after which it has grown.
+        updates: most updates in a row; their number is drawn for each batch.
+    """
+
+    share: float = 0.0
+    begin: float = 0.1
+    full: float = 0.5
+    updates: int = 1
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.share <= 1, f"share is {self.share}, expected 0 to 1")
+        _require(0 <= self.begin <= self.full <= 1, f"begin is {self.begin}, expected 0 to full, which is {self.full}")
+        _require(1 <= self.updates <= 8, f"updates is {self.updates}, expected 1 to 8")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,6 +202,7 @@ class LossConfig:
         contour_points: contour points used of each patch.
         model_points: model points of the point loss.
         symmetry_step_deg: step at which continuous symmetries are sampled for the point loss.
+        confidence_weight: weight of the confidence's cross-entropy, for a network with that output.
     """
 
     name: Literal["contour", "contour-forward", "mse", "point", "contour+point"] = "contour"
@@ -169,6 +212,7 @@ class LossConfig:
     contour_points: int = 100
     model_points: int = 64
     symmetry_step_deg: float = 10.0
+    confidence_weight: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,6 +300,7 @@ class TrainConfig:
         network: architecture.
         window: how patches are cut.
         hypothesis: how pairs are drawn.
+        own_predictions: training on where the network itself moved hypotheses.
         augment: colour augmentation.
         loss: loss.
         optimiser: optimiser.
@@ -273,10 +318,11 @@ class TrainConfig:
         checkpoint_every: steps between checkpoints.
     """
 
-    preset: Literal["paper", "compact"]
+    preset: Literal["paper", "compact", "plus"]
     network: NetworkConfig
     window: WindowConfig
     hypothesis: HypothesisConfig = field(default_factory=HypothesisConfig)
+    own_predictions: OwnPredictionsConfig = field(default_factory=OwnPredictionsConfig)
     augment: AugmentConfig = field(default_factory=AugmentConfig)
     loss: LossConfig = field(default_factory=LossConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
@@ -297,9 +343,14 @@ class TrainConfig:
             value = getattr(self, name)
             _require(value >= 1, f"{name} is {value}, expected 1 or more")
         _require(
-            not self.hypothesis.fresh or self.window.kind == "diameter",
-            "hypothesis.fresh needs window.kind=diameter: a fixed window is the one the shards were cut with",
+            self.recut or not self.augment.occlusion,
+            "augment.occlusion needs pairs made in the training loop: window.kind=diameter or hypothesis.fresh=true",
         )
+
+    @property
+    def recut(self) -> bool:
+        """Whether scenes are cut anew and hypotheses rendered in the training loop; else shards' own pairs are used."""
+        return self.window.kind == "diameter" or self.hypothesis.fresh
 
 
 def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = None) -> TrainConfig:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from posecore.errors import ConfigError, PoseError, ShardError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader
@@ -25,6 +25,7 @@ from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
 from refinenet.objects import load_meshes
+from refinenet.recut import fixed_sides_px
 from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
 
@@ -42,17 +43,21 @@ class Batch(NamedTuple):
         target: What the loss compares its update with.
         sample_ids: (b, 2) shard and row of every pair.
         skipped: What is wrong with shards that others stand in for, each told once by the process that met it.
+        visible_share: How much of each object is visible in its patch.
+        render_colours: What augmentation did to the colours of each render; stays on the processor.
     """
 
     pair: Pair
     target: Target
     sample_ids: Int[Tensor, "b 2"]
     skipped: tuple[str, ...] = ()
+    visible_share: Float[Tensor, " b"] | None = None
+    render_colours: Float[Tensor, "b 3 3"] | None = None
 
     def to(self, device: torch.device) -> "Batch":
         """The same on another device; copies from pinned memory are only queued."""
         pair = Pair(*(x.to(device, non_blocking=True) for x in self.pair))
-        target = Target(*(x.to(device, non_blocking=True) for x in self.target))
+        target = Target(*(None if x is None else x.to(device, non_blocking=True) for x in self.target))
         return self._replace(pair=pair, target=target)
 
 
@@ -68,14 +73,15 @@ class PairSource:
         self._bad: dict[int, str] = {}
         self._untold: list[str] = []
         self._rasteriser: Rasteriser | None = None
-        if config.window.kind == "diameter":
+        if config.recut:
             meshes = load_meshes(self.reader)
             self._rasteriser = Rasteriser(meshes)
             self._make = PairMaker(
                 meshes=meshes,
                 rasteriser=self._rasteriser,
                 patch_px=config.network.patch_px,
-                window_scale=config.window.scale,
+                window=config.window,
+                fixed_sides_px=fixed_sides_px(self.reader.card["objects"]) if config.window.kind == "fixed" else None,
                 contour_points=config.loss.contour_points,
                 hypothesis=config.hypothesis if training else _steady(config),
                 augment_config=self._augment,
@@ -95,6 +101,8 @@ class PairSource:
             ShardError: One cannot be read, without that setting.
         """
         fields = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
+        if self._rasteriser is None and self._config.network.confidence:
+            fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:
             self.reader.refresh()
         read: dict[int, dict[str, Array]] = {}
@@ -160,9 +168,14 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
         scene_distance_px=real(arrays.scene_distance_px),
         hypothesis_distance_px=real(arrays.hypothesis_distance_px),
         object_index=torch.tensor([object_index[int(i)] for i in arrays.obj_id]),
+        scene_bits=torch.from_numpy(np.ascontiguousarray(arrays.scene_bits)),
+        overlap=None if arrays.overlap is None else real(arrays.overlap),
     )
     pair = Pair(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop)
-    return Batch(pair, target, torch.tensor(np.array(ids, np.int64)))
+    return Batch(
+        pair, target, torch.tensor(np.array(ids, np.int64)),
+        visible_share=real(arrays.visible_share), render_colours=real(arrays.render_colours),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -329,7 +342,8 @@ def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]
         main = torch.cuda.current_stream(device)
         main.wait_stream(side)
         for tensor in (*there.pair, *there.target):
-            tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
+            if tensor is not None:
+                tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
         yield there
 
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from posecore import contour, se3
@@ -17,10 +16,12 @@ from posecore.camera import crop_K
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT
-from posecore.window import Window, diameter_window
+from posecore.window import Window
 
 from refinenet import augment
-from refinenet.config import AugmentConfig, HypothesisConfig
+from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig
+from refinenet.recut import hypothesis_window, optical_axis_turn, recut_affine, warp
+from refinenet.visibility import visible_overlap, visible_share
 
 Array = np.ndarray
 MIN_CONTOUR_PX = 12
@@ -46,8 +47,16 @@ class PairArrays:
     hypothesis_contour_m: Float[Array, "b n 3"]
     scene_distance_px: Float[Array, "b p p"]
     hypothesis_distance_px: Float[Array, "b p p"]
+    scene_bits: UInt8[Array, "b p p"]
+    overlap: Float[Array, " b"] | None
+    render_colours: Float[Array, "b 3 3"]
     obj_id: Array
     kept: Array
+
+    @property
+    def visible_share(self) -> Float[Array, " b"]:
+        """How much of each object is visible in its patch, after augmentation."""
+        return visible_share(self.scene_bits)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,6 +71,7 @@ class _Draft:
     turn: Float[Array, "3 3"]
     patch_from_stored: Float[Array, "2 3"]
     scene_distance_px: Float[Array, "p p"]
+    scene_bits: UInt8[Array, "p p"]
     valid: Bool[Array, "p p"]
 
 
@@ -90,57 +100,15 @@ def draw_hypothesis(
     return se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
 
 
-def optical_axis_turn(angle_rad: float) -> Float[Array, "3 3"]:
-    """Rotation of the scene about the camera's optical axis."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def recut_affine(
-    stored: Window, stored_px: int, K: Float[Array, "3 3"], turn: Float[Array, "3 3"], window: Window, patch_px: int
-) -> Float[Array, "2 3"]:
-    """Affine map from the stored patch's pixels to the new patch's, both continuous (pixel centre at + 0.5).
-
-    Args:
-        stored: Window the stored patch was cut with.
-        stored_px: Its side in its own pixels.
-        K: Camera of the full image.
-        turn: Rotation about the optical axis, see `optical_axis_turn`.
-        window: New window, in the image that the turned camera sees.
-        patch_px: Side of the new patch.
-    """
-    image_from_stored = _similarity(stored.side_px / stored_px, stored.x0_px, stored.y0_px)
-    scale = patch_px / window.side_px
-    patch_from_image = _similarity(scale, -window.x0_px * scale, -window.y0_px * scale)
-    return np.asarray((patch_from_image @ K @ turn @ np.linalg.inv(K) @ image_from_stored)[:2])
-
-
-def _similarity(scale: float, dx: float, dy: float) -> Float[Array, "3 3"]:
-    return np.array([[scale, 0.0, dx], [0.0, scale, dy], [0.0, 0.0, 1.0]])
-
-
-def warp(image: Array, affine: Float[Array, "2 3"], patch_px: int, nearest: bool = False) -> Array:
-    """Resample an image by a continuous-pixel affine map; zero outside.
-
-    Colours are blurred first where the map shrinks them, by as much as `posecore.window.cut` blurs with "area".
-    """
-    shrink = 1.0 / float(np.sqrt(abs(np.linalg.det(affine[:, :2]))))
-    if not nearest and shrink > 1.2:
-        image = cv2.GaussianBlur(image, (0, 0), 0.5 * np.sqrt(shrink**2 - 1), borderType=cv2.BORDER_REPLICATE)
-    centred = affine.copy()
-    centred[:, 2] += 0.5 * affine[:, :2].sum(axis=1) - 0.5  # cv2 counts pixel centres as integers
-    flags = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-    return np.asarray(cv2.warpAffine(image, centred, (patch_px, patch_px), flags=flags))
-
-
 class PairMaker:
-    """Makes batches of pairs with diameter windows out of stored scenes.
+    """Makes batches of pairs with windows of their own out of stored scenes.
 
     Args:
         meshes: By object id.
         rasteriser: Draws them; made in the process that uses it.
         patch_px: Side of the new patches.
-        window_scale: Side of the window in projected diameters.
+        window: How windows are cut.
+        fixed_sides_px: Side of each object's window in the full image, for windows of fixed side.
         contour_points: Contour points of each patch.
         hypothesis: How hypotheses are drawn; with `fresh` off, the stored ones are taken.
         augment_config: Colour augmentation.
@@ -152,15 +120,17 @@ class PairMaker:
         meshes: Mapping[int, Mesh],
         rasteriser: Rasteriser,
         patch_px: int,
-        window_scale: float,
+        window: WindowConfig,
         contour_points: int,
         hypothesis: HypothesisConfig,
         augment_config: AugmentConfig,
+        fixed_sides_px: Mapping[int, float] | None = None,
     ) -> None:
         self._meshes = meshes
         self._rasteriser = rasteriser
         self._patch_px = patch_px
-        self._window_scale = window_scale
+        self._window = window
+        self._fixed_sides_px = dict(fixed_sides_px or {})
         self._contour_points = contour_points
         self._hypothesis = hypothesis
         self._augment = augment_config
@@ -181,8 +151,11 @@ class PairMaker:
             return None
         seen += [seen[i % len(seen)] for i in range(len(samples) - len(seen))]
         drafts = [drafts[i] for i in seen]
-        scenes = np.stack([self._scene(d, samples, rngs[d.index]) for d in drafts])
-        scene_rgb, hypothesis_rgb = augment.colour(scenes, rgb[seen], self._augment, rngs[drafts[0].index])
+        scenes, bits = zip(*(self._scene(d, samples, rngs[d.index]) for d in drafts), strict=True)
+        scene_bits = np.stack(bits)
+        scene_rgb, hypothesis_rgb, render_colours = augment.colour(
+            np.stack(scenes), rgb[seen], self._augment, rngs[drafts[0].index]
+        )
         points = [
             contour.sample_contour(depth[i] > 0, depth[i], d.K_crop, self._contour_points, rngs[d.index])
             for i, d in zip(seen, drafts, strict=True)
@@ -197,6 +170,9 @@ class PairMaker:
             hypothesis_contour_m=np.stack(points),
             scene_distance_px=np.stack([d.scene_distance_px for d in drafts]),
             hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
+            scene_bits=scene_bits,
+            overlap=visible_overlap(depth[seen] > 0, scene_bits),
+            render_colours=render_colours,
             obj_id=np.array([int(d.sample["obj_id"]) for d in drafts]),
             kept=np.array([d.index for d in drafts]),
         )
@@ -217,7 +193,8 @@ class PairMaker:
                 guess = T_turn @ sample["T_cam_obj_hypothesis"]
             if (guess[:3, :3] @ mesh.center_m + guess[:3, 3])[2] < mesh.diameter_m:
                 continue
-            window = diameter_window(sample["K"], guess, mesh.center_m, mesh.diameter_m, self._window_scale)
+            fixed_px = self._fixed_sides_px.get(int(sample["obj_id"]), stored.side_px)
+            window = hypothesis_window(self._window, sample["K"], guess, mesh, fixed_px)
             affine = recut_affine(stored, stored_px, sample["K"], turn, window, self._patch_px)
             bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
             valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
@@ -233,6 +210,7 @@ class PairMaker:
                     turn=turn,
                     patch_from_stored=affine,
                     scene_distance_px=contour.distance_transform_px(outline),
+                    scene_bits=bits,
                     valid=valid,
                 )
         return None
@@ -251,19 +229,23 @@ class PairMaker:
 
     def _scene(
         self, draft: _Draft, samples: Sequence[Mapping[str, Any]], rng: np.random.Generator
-    ) -> UInt8[Array, "p p 3"]:
-        scene = warp(draft.sample["scene_rgb"], draft.patch_from_stored, self._patch_px)
+    ) -> tuple[UInt8[Array, "p p 3"], UInt8[Array, "p p"]]:
+        """Scene patch and its masks, with background and occluders exchanged."""
+        scene, bits = warp(draft.sample["scene_rgb"], draft.patch_from_stored, self._patch_px), draft.scene_bits
         exchange = rng.random() < self._augment.background
-        if not exchange and draft.valid.all():
-            return scene
-        other = samples[int(rng.integers(len(samples)))]
-        behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, self._patch_px, rng)
-        keep = draft.valid
-        if exchange:
-            bits = warp(draft.sample["scene_mask"], draft.patch_from_stored, self._patch_px, nearest=True)
-            keep = keep & ((bits & BIT_FOREGROUND) > 0)
-        # The stored window's edge must not show: it was centred near the truth and would give the answer away.
-        return np.where(keep[..., None], scene, behind)
+        if exchange or not draft.valid.all():
+            other = samples[int(rng.integers(len(samples)))]
+            foreground = (other["scene_mask"] & BIT_FOREGROUND) > 0
+            behind = augment.backdrop(other["scene_rgb"], foreground, self._patch_px, rng)
+            keep = draft.valid & ((bits & BIT_FOREGROUND) > 0) if exchange else draft.valid
+            # The stored window's edge must not show: centred near the truth, it would give the answer away.
+            scene = np.where(keep[..., None], scene, behind)
+        if self._augment.occlusion and rng.random() < self._augment.occlusion:
+            other = samples[int(rng.integers(len(samples)))]
+            scene, bits = augment.occlude(
+                scene, bits, other["scene_rgb"], other["scene_mask"], self._augment.occlusion_leaves, rng
+            )
+        return scene, bits
 
     def _scene_points(self, draft: _Draft) -> Float[Array, "n 3"]:
         points = draft.sample["scene_contour_cam_m"]

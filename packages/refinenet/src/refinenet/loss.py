@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from refinenet import geometry
@@ -23,6 +23,8 @@ class Target(NamedTuple):
         scene_distance_px: (b, p, p) distance transform of the scene's contour.
         hypothesis_distance_px: (b, p, p) distance transform of the hypothesis' contour.
         object_index: (b,) row of each sample's object in `ObjectPoints`.
+        scene_bits: (b, p, p) the scene's masks in the patch, bits as in shards' `scene_mask`; None where not known.
+        overlap: (b,) how well the hypothesis' silhouette fits what is visible, see `visibility.visible_overlap`.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]
@@ -33,6 +35,8 @@ class Target(NamedTuple):
     scene_distance_px: Float[Tensor, "b p p"]
     hypothesis_distance_px: Float[Tensor, "b p p"]
     object_index: Int[Tensor, " b"]
+    scene_bits: UInt8[Tensor, "b p p"] | None = None
+    overlap: Float[Tensor, " b"] | None = None
 
 
 class ObjectPoints(NamedTuple):
@@ -131,11 +135,25 @@ def point_loss_px(
     return (rotation_weight * rotation_m + plane_m + depth_m) * px_per_m
 
 
+def confidence_loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+    """Cross-entropy of the confidence against the visible overlap of the hypothesis, which it was asked about."""
+    assert update.confidence is not None and target.overlap is not None
+    return torch.nn.functional.binary_cross_entropy_with_logits(
+        update.confidence.float(), target.overlap, reduction="none"
+    )
+
+
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
 
 
 def make_loss(
-    name: str, *, gamma: float, point_weight: float, rotation_weight: float = 1.0, objects: ObjectPoints | None
+    name: str,
+    *,
+    gamma: float,
+    point_weight: float,
+    rotation_weight: float = 1.0,
+    confidence_weight: float = 1.0,
+    objects: ObjectPoints | None,
 ) -> Callable[[PoseUpdate, Target], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
 
@@ -144,6 +162,7 @@ def make_loss(
         gamma: weight of the translation in `mse`, per metre.
         point_weight: weight of the point loss in `contour+point`.
         rotation_weight: weight of the rotation within the point loss.
+        confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
         objects: model points, for the losses with `point` in their name.
     """
 
@@ -158,4 +177,10 @@ def make_loss(
         "point": points,
         "contour+point": lambda update, target: contour_loss_px(update, target) + point_weight * points(update, target),
     }
-    return table[name]
+    pose = table[name]
+
+    def loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+        value = pose(update, target)
+        return value if update.confidence is None else value + confidence_weight * confidence_loss(update, target)
+
+    return loss

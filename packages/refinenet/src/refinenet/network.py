@@ -1,4 +1,4 @@
-"""The two networks: PaperNet (two frozen stems, late fusion) and CompactNet (small, local correlation)."""
+"""PaperNet (frozen stems, late fusion), CompactNet (local matching, for two CPU cores) and PlusNet (for a GPU)."""
 
 from typing import NamedTuple
 
@@ -6,10 +6,10 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from refinenet import geometry
 from refinenet.backbone import ConvNorm, InceptionA, make_stem
 from refinenet.config import NetworkConfig
 from refinenet.geometry import PoseUpdate
+from refinenet.heads import ROTATION_BIAS, forms, pose_update, start_linear
 
 
 class Pair(NamedTuple):
@@ -52,9 +52,9 @@ class _Branch(nn.Module):
 class PaperNet(nn.Module):
     """The 2018 design: both 224 px patches through one frozen stem, then Inception-A blocks and two branches.
 
-    Output: a quaternion and a translation in metres, both in camera axes about the object's origin. Heads start at
-    the identity. Left open by the paper and settled here: 384 channels in the strided convolution beside the pooling,
-    `config.branch_channels` before the heads, batch norm in the trained blocks.
+    Output: a quaternion and a translation in metres, both in camera axes about the object's origin, unless the config
+    asks for others. Heads start at the identity. Left open by the paper and settled here: 384 channels in the strided
+    convolution beside the pooling, `config.branch_channels` before the heads, batch norm in the trained blocks.
 
     Source: Manhardt et al., ECCV 2018, section 3.3.
     """
@@ -66,8 +66,15 @@ class PaperNet(nn.Module):
         self.pool = nn.MaxPool2d(3, stride=2)
         self.down = ConvNorm(channels, 384, 3, stride=2)
         self.blocks = nn.Sequential(InceptionA(channels + 384), InceptionA(InceptionA.c_out))
-        self.rotation = _Branch(config.branch_channels, 4, (1.0, 0.0, 0.0, 0.0), config.head_std)
-        self.translation = _Branch(config.branch_channels, 3, (0.0, 0.0, 0.0), config.head_std)
+        rotation, translation = forms(config)
+        self.rotation = self._branch(ROTATION_BIAS[rotation], config)
+        self.translation = self._branch((0.0, 0.0, 0.0), config)
+        self.confidence = self._branch((0.0,), config) if config.confidence else None
+        self.crop, self.patch_px = translation == "crop", config.patch_px
+
+    @staticmethod
+    def _branch(bias: tuple[float, ...], config: NetworkConfig) -> _Branch:
+        return _Branch(config.branch_channels, len(bias), bias, config.head_std)
 
     def forward(self, pair: Pair) -> PoseUpdate:
         """The update of each hypothesis."""
@@ -76,9 +83,13 @@ class PaperNet(nn.Module):
             low = self.stem(normalised(torch.cat((pair.scene_rgb, pair.hypothesis_rgb))))
         x = torch.cat((low[:b], low[b:]), 1)
         x = self.blocks(torch.cat((self.pool(x), self.down(x)), 1))
-        quat, translation = self.rotation(x), self.translation(x)
+        rotation, translation = self.rotation(x), self.translation(x)
+        confidence = None if self.confidence is None else self.confidence(x).float()
         with torch.autocast(x.device.type, enabled=False):
-            return PoseUpdate(geometry.rotation_from_quat_wxyz(quat.float()), translation.float())
+            return pose_update(
+                rotation.float(), translation.float(), pair.T_cam_obj, pair.K_crop, self.patch_px, crop=self.crop,
+                confidence=confidence,
+            )  # fmt: skip
 
 
 class LocalCorrelation(nn.Module):
@@ -123,34 +134,44 @@ class CompactNet(nn.Module):
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
-        first, second = config.encoder
-        self.scene = nn.Sequential(
-            ConvNorm(3, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
-        )
-        self.hypothesis = nn.Sequential(
-            ConvNorm(3, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
-        )
+        second = config.encoder[1]
+        self.scene, self.hypothesis = self._encoder(config), self._encoder(config)
         self.match_scene = nn.Conv2d(second, config.match_channels, 1)
         self.match_hypothesis = nn.Conv2d(second, config.match_channels, 1)
-        cells = config.patch_px // 4
-        self.correlation = LocalCorrelation(cells, config.match_radius)
+        self.correlation = LocalCorrelation(config.patch_px // 4, config.match_radius)
         self.appearance = ConvNorm(2 * second, config.appearance_channels, 3, stride=2, padding=1)
+        self.mix = self._mixer(self.correlation.side**2 + config.appearance_channels, config)
+        self.norm = nn.Sequential(nn.LayerNorm(config.hidden), nn.GELU())
+        rotation, translation = forms(config)
+        self.rotation = nn.Linear(config.hidden, len(ROTATION_BIAS[rotation]))
+        self.translation = nn.Linear(config.hidden, 3)
+        start_linear(self.rotation, ROTATION_BIAS[rotation], config.head_std)
+        start_linear(self.translation, (0.0, 0.0, 0.0), config.head_std)
+        self.confidence: nn.Linear | None = None
+        if config.confidence:
+            self.confidence = nn.Linear(config.hidden, 1)
+            start_linear(self.confidence, (0.0,), config.head_std)
+        self.crop, self.patch_px = translation == "crop", config.patch_px
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    @staticmethod
+    def _encoder(config: NetworkConfig) -> nn.Module:
+        """From a patch to a quarter of its size."""
+        first, second = config.encoder
+        return nn.Sequential(
+            ConvNorm(3, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
+        )
+
+    @staticmethod
+    def _mixer(channels: int, config: NetworkConfig) -> nn.Module:
+        """From an eighth of the patch's size to what the heads read."""
         mixed, last = config.widths
-        self.mix = nn.Sequential(
-            ConvNorm(self.correlation.side**2 + config.appearance_channels, mixed, 1),
+        return nn.Sequential(
+            ConvNorm(channels, mixed, 1),
             ConvNorm(mixed, last, 3, padding=1),
             nn.Flatten(),
-            nn.Linear(last * (cells // 2) ** 2, config.hidden),
+            nn.Linear(last * (config.patch_px // 8) ** 2, config.hidden),
         )
-        self.norm = nn.Sequential(nn.LayerNorm(config.hidden), nn.GELU())
-        self.rotation = nn.Linear(config.hidden, 6)
-        self.translation = nn.Linear(config.hidden, 3)
-        for head, bias in ((self.rotation, (1.0, 0.0, 0.0, 0.0, 1.0, 0.0)), (self.translation, (0.0, 0.0, 0.0))):
-            nn.init.normal_(head.weight, std=config.head_std)
-            with torch.no_grad():
-                head.bias.copy_(torch.tensor(bias))
-        self.patch_px = config.patch_px
-        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
     def features(self, pair: Pair) -> Float[Tensor, "b h"]:
         """What the heads read; runs in reduced precision under autocast."""
@@ -165,10 +186,58 @@ class CompactNet(nn.Module):
         x = self.features(pair)
         with torch.autocast(x.device.type, enabled=False):  # poses need every digit
             x = self.norm(x.float())
-            rotation_ray = geometry.rotation_from_6d(self.rotation(x))
-            return geometry.crop_update(rotation_ray, self.translation(x), pair.T_cam_obj, pair.K_crop, self.patch_px)
+            return pose_update(
+                self.rotation(x), self.translation(x), pair.T_cam_obj, pair.K_crop, self.patch_px, crop=self.crop,
+                confidence=None if self.confidence is None else self.confidence(x),
+            )  # fmt: skip
+
+
+class Residual(nn.Module):
+    """Two 3 x 3 convolutions beside the identity, or beside a 1 x 1 convolution where size or channels change."""
+
+    def __init__(self, c_in: int, c_out: int, stride: int = 1) -> None:
+        super().__init__()
+        self.first = ConvNorm(c_in, c_out, 3, stride=stride, padding=1)
+        self.second = nn.Sequential(nn.Conv2d(c_out, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out, eps=1e-3))
+        same = stride == 1 and c_in == c_out
+        self.beside: nn.Module = nn.Identity() if same else nn.Conv2d(c_in, c_out, 1, stride=stride)
+
+    def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d u v"]:
+        """Features after the ReLU."""
+        return torch.relu(self.second(self.first(x)) + self.beside(x))
+
+
+class PlusNet(CompactNet):
+    """`CompactNet` with residual blocks, sized for a GPU: matched at an eighth of the patch, read at a 32nd."""
+
+    @staticmethod
+    def _encoder(config: NetworkConfig) -> nn.Module:
+        first, second = config.encoder
+        return nn.Sequential(
+            ConvNorm(3, first, 7, stride=2, padding=3), Residual(first, first), Residual(first, second, stride=2),
+            Residual(second, second),
+        )  # fmt: skip
+
+    @staticmethod
+    def _mixer(channels: int, config: NetworkConfig) -> nn.Module:
+        mixed, last = config.widths
+        return nn.Sequential(
+            ConvNorm(channels, mixed, 1),
+            Residual(mixed, mixed),
+            Residual(mixed, last, stride=2),
+            Residual(last, last, stride=2),
+            nn.Flatten(),
+            nn.Linear(last * (config.patch_px // 32) ** 2, config.hidden),
+        )
+
+
+NETWORKS: dict[str, type[PaperNet] | type[CompactNet]] = {
+    "paper": PaperNet,
+    "compact": CompactNet,
+    "plus": PlusNet,
+}
 
 
 def make_network(config: NetworkConfig) -> nn.Module:
     """The network a config describes, with fresh weights (the stem's too: see `backbone.load_pretrained`)."""
-    return PaperNet(config) if config.kind == "paper" else CompactNet(config)
+    return NETWORKS[config.kind](config)

@@ -19,7 +19,7 @@ from posecore.files import storage_error, write_atomic
 from posecore.shard import ShardReader, n_shards
 
 Array = np.ndarray
-ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN = range(5)
+ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, OWN = range(6)
 """First key of each random stream, so that no two streams of a run share draws."""
 
 RECORD, GROWTH = "data.json", "growth"

@@ -10,6 +10,7 @@ from posecore.shard import BIT_FOREGROUND
 from refinenet import augment
 from refinenet.config import AugmentConfig, TrainConfig
 from refinenet.hypothesis import PairArrays
+from refinenet.visibility import visible_overlap
 
 STORED_FIELDS = (
     "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
@@ -49,7 +50,10 @@ def stored_pairs(
             other = samples[int(rng.integers(len(samples)))]
             behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng)
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
-    scene_rgb, hypothesis_rgb = augment.colour(scenes, stack("hypothesis_rgb"), augment_config, rngs[0])
+    overlap = None
+    if "hypothesis_depth_m" in samples[0]:
+        overlap = visible_overlap(stack("hypothesis_depth_m") > 0, stack("scene_mask"))
+    scene_rgb, hypothesis_rgb, render_colours = augment.colour(scenes, stack("hypothesis_rgb"), augment_config, rngs[0])
     return PairArrays(
         scene_rgb=scene_rgb,
         hypothesis_rgb=hypothesis_rgb,
@@ -60,6 +64,9 @@ def stored_pairs(
         hypothesis_contour_m=stack("hypothesis_contour_cam_m")[:, thin],
         scene_distance_px=stack("scene_distance_px"),
         hypothesis_distance_px=stack("hypothesis_distance_px"),
+        scene_bits=stack("scene_mask"),
+        overlap=overlap,
+        render_colours=render_colours,
         obj_id=stack("obj_id"),
         kept=np.arange(len(samples)),
     )

@@ -27,6 +27,7 @@ from refinenet.loss import make_loss
 from refinenet.network import Pair, PaperNet, make_network
 from refinenet.objects import load_meshes, load_models, object_points
 from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
+from refinenet.own_predictions import OwnPredictions
 from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows
 
 log = logging.getLogger(__name__)
@@ -88,16 +89,17 @@ class Trainer:
         reader = ShardReader(url)
         self.training, self.validation, self._record = self._split(reader, resume=resume)
         self._held_out = self._make_held_out()
-        points = object_points(
-            load_meshes(reader), load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg
-        )
+        meshes = load_meshes(reader)
+        points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
+        self._own_predictions = OwnPredictions(config, meshes, self.rank)
         self.objects = points.to(self.device)
         self._dataset_sha256, self._objects_card = _dataset_sha256(reader, config), reader.card["objects"]
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
         self.network = make_network(config.network).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._loss = make_loss(
             config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
-            rotation_weight=config.loss.rotation_weight, objects=self.objects,
+            rotation_weight=config.loss.rotation_weight, confidence_weight=config.loss.confidence_weight,
+            objects=self.objects,
         )  # fmt: skip
         self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
         self._optimiser = make_optimiser(self.network, config.optimiser)
@@ -221,6 +223,7 @@ class Trainer:
             batch = batch.to(self.device)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
+                    batch = self._own_predictions(self.network, batch, self.step, i)
                     update = self._predict(batch.pair)
                 losses.append(self._loss(update, batch.target))
                 (losses[-1].mean() / len(batches)).backward()
@@ -237,7 +240,9 @@ class Trainer:
             self._average.update(self.step)
         self.step += 1
         loss = torch.stack([values.detach().mean() for values in losses]).mean()
-        return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm}
+        shares = [batch.visible_share for batch in batches if batch.visible_share is not None]
+        told = {"visible_share": torch.stack([share.mean() for share in shares]).mean()} if shares else {}
+        return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm, **told}
 
     def _predict(self, pair: Pair) -> PoseUpdate:
         if not self.config.compile:
@@ -311,6 +316,7 @@ class Trainer:
         The reducer goes first: were it the last owner of the group, its destructor would wait, with Python's lock
         held, for a thread that needs that lock.
         """
+        self._own_predictions.close()
         self._parallel = self._forward = self.network
         gc.collect()
 
