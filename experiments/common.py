@@ -21,6 +21,8 @@ from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, show
 TUG, BOBBIN = (ROOT / "examples" / "objects" / f"{name}.ply" for name in ("tug", "bobbin"))
 SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
 NEED_DEPTH = ("depth-icp",)
+HYPOTHESES_PER_SCENE = 8
+"""Of the presets that experiments render with."""
 SCORES = (
     "expected", "missing", "vss_mean", "re_sym_deg_mean", "re_sym_deg_median", "tx_mm_mean", "ty_mm_mean", "tz_mm_mean",
     "add_s_recall_0.1d",
@@ -81,11 +83,13 @@ class Network:
     Attributes:
         train: Options of `refinenet train`.
         pairs: Options of `synthgen render` for its training pairs beside those of the experiment.
+        share: Its number of pairs is that of the experiment divided by this.
         checkpoint: Taken as it is, instead of training.
     """
 
     train: str = ""
     pairs: str = ""
+    share: int = 1
     checkpoint: Path | None = None
 
 
@@ -97,9 +101,14 @@ def small_networks(options: str, names: tuple[str, ...]) -> dict[str, Network]:
 
 
 def full_networks(inputs: Inputs) -> dict[str, Network]:
-    """Preset `paper` with each loss, 100 000 steps of 16 pairs."""
+    """Preset `paper` with each loss, 100 000 steps of 16 pairs, and preset `plus`.
+
+    `plus` cuts its own window out of wider patches and draws its own hypotheses: it gets as many scenes, each once.
+    """
     losses = ("mse", "contour-forward", "contour")
-    return {loss: Network(train=f"--preset paper --loss {loss} {inputs.stem()}") for loss in losses}
+    networks = {loss: Network(train=f"--preset paper --loss {loss} {inputs.stem()}") for loss in losses}
+    wide = "--set window.padding=0.6 --set hypotheses_per_scene=1"
+    return networks | {"plus": Network(train="--preset plus", pairs=wide, share=HYPOTHESES_PER_SCENE)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,32 +186,27 @@ def compared(work: Path, what: Comparison) -> list[Step]:
 def trainings(work: Path, what: Comparison) -> Iterator[Step]:
     """Render the pairs that networks train on and train them; networks of the same pairs share them."""
     folder = quoted(work)
-    groups = {f"_{number:06d}": mesh for number, mesh in what.each.items()} or {"": what.objects}
     trained = {name: network for name, network in what.networks.items() if network.checkpoint is None}
-    kinds = list(dict.fromkeys(network.pairs for network in trained.values()))
-    for group, objects in groups.items():
-        for kind, options in enumerate(kinds):
-            out = f"shards{kind or ''}{group}"
+    kinds = list(dict.fromkeys((network.pairs, network.share) for network in trained.values()))
+    shards = {kind: f"shards{number or ''}" for number, kind in enumerate(kinds)}
+    groups = {f"_{number:06d}": (f", object {number}", mesh) for number, mesh in what.each.items()}
+    for group, (which, objects) in (groups or {"": ("", what.objects)}).items():
+        for (options, share), name in shards.items():
+            render = f"synthgen render {objects} {what.scenes} {options} --n {what.pairs // share} --seed 1"
             yield Step(
-                name=out,
-                why=f"Training pairs{f', object {int(group[1:])}' if group else ''}, from meshes alone.",
-                command=words(
-                    f"synthgen render {objects} {what.scenes} {options} --n {what.pairs} --seed 1"
-                    f" --workers {what.workers} --out {folder}/{out}"
-                ),
-                leaves=f"{out}/manifest.jsonl",
+                name=f"{name}{group}",
+                why=f"Training pairs{which}, from meshes alone.",
+                command=words(f"{render} --workers {what.workers} --out {folder}/{name}{group}"),
+                leaves=f"{name}{group}/manifest.jsonl",
             )
         for name, network in trained.items():
-            run = f"run_{name}{group}"
+            train = f"refinenet train {folder}/{shards[network.pairs, network.share]}{group} {network.train} --seed 0"
             yield Step(
                 name=f"train-{name}{group}",
-                why=f"Network '{name}'{f', object {int(group[1:])}' if group else ''}.",
-                command=words(
-                    f"refinenet train {folder}/shards{kinds.index(network.pairs) or ''}{group} {network.train}"
-                    f" --seed 0 --out {folder}/{run}"
-                ),
-                leaves=f"{run}/best.safetensors",
-                run=run,
+                why=f"Network '{name}'{which}.",
+                command=words(f"{train} --out {folder}/run_{name}{group}"),
+                leaves=f"run_{name}{group}/best.safetensors",
+                run=f"run_{name}{group}",
             )
 
 

@@ -8,7 +8,7 @@ Weights do not matter for speed, so networks without a shipped checkpoint are tr
 mean nothing.
 
   --smoke  the shipped checkpoint, 2 images: a test of the plumbing
-  --small  the shipped checkpoint, preset paper, and the baselines, 30 images
+  --small  the shipped checkpoint, presets paper and plus, and the baselines, 30 images
   --full   the same with 200 images; a GPU
 
     python experiments/speed.py --small
@@ -22,14 +22,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import SHIPPED, TUG, Comparison, Experiment, Inputs, Network, compared, main, median_ms
 
-PAPER = "--preset paper --steps 2 --batch 4 --set backbone.pretrained=false --set validation.pairs=4 --threads 1"
+UNTRAINED = "--steps 2 --batch 4 --set validation.pairs=4 --set loader.workers=1 --threads 1"
 
 
 def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     networks = {"compact": Network(checkpoint=SHIPPED)}
     if size != "smoke":
-        networks["paper"] = Network(train=PAPER)
+        networks["paper"] = Network(train=f"--preset paper --set backbone.pretrained=false {UNTRAINED}")
+        networks["plus"] = Network(train=f"--preset plus {UNTRAINED}")
     return compared(
         work,
         Comparison(

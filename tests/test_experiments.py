@@ -8,7 +8,11 @@ import sys
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
+from posecore import se3
+from posecore.bop import Estimate, load_models_info, read_results, read_sidecar, write_results
+from posecore.mesh import load_mesh
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments import common, cups, join
@@ -173,3 +177,34 @@ def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
     assert levels[-1] == 45
     assert all(step["seconds"] > 0 for step in result["steps"])
+
+
+def test_parts_join_into_one_result_file(tmp_path) -> None:
+    here = se3.make_T(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    lines = [Estimate(scene_id=1, im_id=im_id, obj_id=1 + im_id, T_cam_obj=here) for im_id in range(3)]
+    parts = [tmp_path / "a_1.csv", tmp_path / "a_2.csv"]
+    write_results(
+        parts[0], lines[:1], {"dataset": "toy", "start_lines": [2], "failed_lines": [3], "checkpoint_sha256": "x"}
+    )
+    write_results(parts[1], lines[1:], {"dataset": "toy", "start_lines": [4, 5], "failed_lines": []})
+    join.join(parts, tmp_path / "a.csv")
+    assert [line.obj_id for line in read_results(tmp_path / "a.csv")] == [1, 2, 3]
+    sidecar = read_sidecar(tmp_path / "a.csv")
+    assert sidecar is not None
+    assert (sidecar["method"], sidecar["dataset"]) == ("a", "toy")
+    assert (sidecar["start_lines"], sidecar["failed_lines"]) == ([2, 4, 5], [3])
+    assert sidecar["parts"] == {"a_1.csv": "x", "a_2.csv": None}
+
+
+def test_a_category_has_one_diameter_and_an_unseen_member(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["cups.py", str(tmp_path), "--count", "4"])
+    assert cups.main() == 0
+    trained = sorted((tmp_path / "train").glob("obj_*.ply"))
+    (unseen,) = (tmp_path / "unseen").glob("obj_*.ply")
+    meshes = [load_mesh(path, units="mm") for path in (unseen, *trained)]
+    assert len({mesh.sha256 for mesh in meshes}) == 5
+    assert all(abs(mesh.diameter_m - cups.DIAMETER_M) < 1e-5 for mesh in meshes)
+    known = load_models_info(tmp_path / "train" / "models_info.json")
+    assert [known[number].is_symmetric for number in (1, 2, 3, 4)] == [False, True, False, True]
+    symmetric = np.ptp(meshes[2].vertices_m[:, 0]) - np.ptp(meshes[2].vertices_m[:, 1])
+    assert abs(symmetric) < 1e-4 < abs(np.ptp(meshes[1].vertices_m[:, 0]) - np.ptp(meshes[1].vertices_m[:, 1]))
