@@ -1,4 +1,4 @@
-"""A report folder: one HTML page, one CSV line for each pose, one JSON summary."""
+"""A report folder: one HTML page, its tables as Markdown and LaTeX, one CSV line for each pose, one JSON summary."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -15,10 +15,12 @@ from posecore.files import write_atomic
 
 from evalkit.evaluate import Evaluator, VssKind
 from evalkit.files import load_result_files
+from evalkit.formats import write_tables
 from evalkit.page import report_page
 from evalkit.pairing import Pair, Pairing, pair_up
 from evalkit.scored import Scored
 from evalkit.summary import summarise
+from evalkit.summary_tables import report_tables
 
 Array = np.ndarray
 NO_POSE = np.full((4, 4), np.nan)
@@ -33,6 +35,7 @@ class Report:
     page: Path
     table: Path
     summary_file: Path
+    tables: tuple[Path, ...]
     summary: dict[str, Any]
 
 
@@ -45,7 +48,7 @@ def write_report(
     worst: int = 12,
     start: Start = lambda name, total: lambda done: None,
 ) -> Report:
-    """Evaluate result files and write `index.html`, `estimates.csv` and `summary.json` into `out`.
+    """Evaluate result files; write `index.html`, `tables.md`, `tables.tex`, `estimates.csv`, `summary.json` into `out`.
 
     Args:
         dataset: with ground truth.
@@ -79,10 +82,13 @@ def write_report(
         page=out / "index.html",
         table=out / "estimates.csv",
         summary_file=out / "summary.json",
+        tables=(out / "tables.md", out / "tables.tex"),
         summary=summary,
     )
     write_atomic(written.table, estimates_csv(scored).encode())
     write_atomic(written.summary_file, (json.dumps(summary, indent=2, allow_nan=False) + "\n").encode())
+    for file in written.tables:
+        write_tables(file, report_tables(summary))
     write_atomic(written.page, page.encode())
     return written
 

@@ -33,10 +33,11 @@ from evalkit.report import write_report
 def report(
     dataset: Path | None, results: tuple[Path, ...], out: Path, split: str | None, vss: VssKind, worst: int
 ) -> None:
-    """Write a report: one HTML page, a CSV line for each pose, a JSON summary.
+    """Write a report: one HTML page, its tables for papers, a CSV line for each pose, a JSON summary.
 
     Without options, it takes the result files (*.csv with *.csv.json beside it) in this folder and in results/, and
-    the dataset that their sidecars name.
+    the dataset that their sidecars name. The folder then holds index.html (everything, in one file that opens
+    offline), tables.md and tables.tex, estimates.csv and summary.json.
 
     \b
     Examples:
