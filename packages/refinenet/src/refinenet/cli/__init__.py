@@ -2,6 +2,7 @@
 
 import click
 
+from refinenet.cli.export import export
 from refinenet.cli.group import CleanGroup
 from refinenet.cli.refine import refine
 from refinenet.cli.track import track
@@ -23,5 +24,5 @@ def main() -> None:
     """
 
 
-for _command in (refine, track, train):
+for _command in (export, refine, track, train):
     main.add_command(_command)
