@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import ROOT, Step, quoted, words
-from experiments.common import Comparison, Experiment, Inputs, compared, full_networks, main, small_networks
+from experiments.common import ON_GPUS, Comparison, Experiment, Inputs, compared, full_networks, main, small_networks
 
 TRAINING = {
     "smoke": "--steps 16 --batch 8 --set validation.pairs=16 --threads 1",
@@ -52,6 +52,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
                 starts="--random-up-to 20 --random-translation 0.2",
                 refine="--allow-other-mesh",
                 workers=8 if full else 2,
+                render=ON_GPUS if full else "--workers 2",
             ),
         ),
     ]

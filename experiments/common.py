@@ -21,6 +21,7 @@ from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, show
 TUG, BOBBIN = (ROOT / "examples" / "objects" / f"{name}.ply" for name in ("tug", "bobbin"))
 SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
 NEED_DEPTH = ("depth-icp",)
+ON_GPUS = "--device auto"
 HYPOTHESES_PER_SCENE = 8
 """Of the presets that experiments render with."""
 SCORES = (
@@ -127,7 +128,8 @@ class Comparison:
         iterations: Most updates of a pose.
         dataset: Real test images, instead of rendered ones.
         init: Start poses for them, instead of perturbed ones.
-        workers: Processes that render.
+        workers: Processes that render test images.
+        render: Options of `synthgen render` that say where it runs.
         refine: Further options of `refinenet refine` with a network.
         tested: Options of `synthgen` that name the meshes in test images, where those are others.
     """
@@ -144,6 +146,7 @@ class Comparison:
     dataset: Path | None = None
     init: Path | None = None
     workers: int = 2
+    render: str = "--workers 2"
     refine: str = ""
     tested: str | None = None
 
@@ -196,7 +199,7 @@ def trainings(work: Path, what: Comparison) -> Iterator[Step]:
             yield Step(
                 name=f"{name}{group}",
                 why=f"Training pairs{which}, from meshes alone.",
-                command=words(f"{render} --workers {what.workers} --out {folder}/{name}{group}"),
+                command=words(f"{render} {what.render} --out {folder}/{name}{group}"),
                 leaves=f"{name}{group}/manifest.jsonl",
             )
         for name, network in trained.items():

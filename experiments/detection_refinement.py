@@ -23,6 +23,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
+    ON_GPUS,
     SHIPPED,
     TUG,
     Comparison,
@@ -51,6 +52,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             networks=full_networks(inputs),
             starts=STARTS,
             workers=8,
+            render=ON_GPUS,
         )
     else:
         what = Comparison(

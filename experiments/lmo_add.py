@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
     NEED_DEPTH,
+    ON_GPUS,
     Comparison,
     Experiment,
     Inputs,
@@ -66,6 +67,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             dataset=data,
             init=init[0],
             workers=8 if full else 2,
+            render=ON_GPUS if full else "--workers 2",
         ),
     )
 

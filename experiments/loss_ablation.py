@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
     BOBBIN,
+    ON_GPUS,
     TUG,
     Comparison,
     Experiment,
@@ -53,6 +54,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             networks=full_networks(inputs) if full else small_networks(TRAINING[size], losses),
             starts="--random-up-to 20 --random-translation 0.2",
             workers=8 if full else 2,
+            render=ON_GPUS if full else "--workers 2",
         ),
     )
 

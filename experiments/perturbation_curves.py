@@ -25,6 +25,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
+    ON_GPUS,
     SHIPPED,
     TUG,
     Comparison,
@@ -57,6 +58,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
                 starts=PROTOCOL,
                 iterations=10,
                 workers=8,
+                render=ON_GPUS,
             ),
         )
     return compared(

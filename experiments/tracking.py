@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted, words
 from experiments.common import (
     BOBBIN,
+    ON_GPUS,
     SHIPPED,
     TUG,
     Comparison,
@@ -55,6 +56,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
         pairs=200_000,
         networks=full_networks(inputs) if full else {"shipped": Network(checkpoint=SHIPPED)},
         workers=8 if full else 2,
+        render=ON_GPUS if full else "--workers 2",
     )
     sequences, frames = SEQUENCES[size]
     options = f"{what.scenes} --sequence --sequences {sequences} --workers {what.workers}"
