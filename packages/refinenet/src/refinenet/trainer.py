@@ -23,6 +23,7 @@ from refinenet.config import TrainConfig
 from refinenet.data import Batch, PairSource, PairStream, make_loader, on_device, validation_batches
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
+from refinenet.inputs import mesh_digest
 from refinenet.loss import make_loss
 from refinenet.network import Pair, PaperNet, make_network
 from refinenet.objects import load_meshes, load_models, object_points
@@ -93,7 +94,10 @@ class Trainer:
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
         self._own_predictions = OwnPredictions(config, meshes, self.rank)
         self.objects = points.to(self.device)
-        self._dataset_sha256, self._objects_card = _dataset_sha256(reader, config), reader.card["objects"]
+        self._dataset_sha256 = _dataset_sha256(reader, config)
+        self._objects_card = {
+            key: {**entry, "mesh_digest": mesh_digest(meshes[int(key)])} for key, entry in reader.card["objects"].items()
+        }
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
         self.network = make_network(config.network).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._loss = make_loss(
