@@ -96,7 +96,7 @@ class Trainer:
         self.objects = points.to(self.device)
         self._dataset_sha256 = _dataset_sha256(reader, config)
         self._objects_card = {
-            key: {**entry, "mesh_digest": mesh_digest(meshes[int(key)])} for key, entry in reader.card["objects"].items()
+            key: {**card, "mesh_digest": mesh_digest(meshes[int(key)])} for key, card in reader.card["objects"].items()
         }
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
         self.network = make_network(config.network).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
