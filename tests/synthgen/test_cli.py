@@ -114,3 +114,26 @@ def test_bop_renders_frames(tug_ply, tmp_path, small_set):
     assert result.exit_code == 0, result.output
     assert (tmp_path / "bop/test/000001/rgb/000000.png").is_file()
     assert (tmp_path / "bop/test_targets_bop19.json").is_file()
+
+
+def test_a_mended_setting_may_use_the_folder_of_a_run_that_never_began(tug_ply, tmp_path, small_set):
+    """Settings that cannot be drawn leave no folder, whose data card would refuse the ones that can."""
+    out = tmp_path / "out"
+    render = ["render", "--object", tug_ply, "--n", 4, "--out", out, "--quiet", "--workers", 1, *small_set]
+    refused = invoke(*render, "--set", "window.min_area_px=2000")
+    assert refused.exit_code != 0
+    assert "lower window.min_area_px" in error_line(refused)
+    assert not out.exists()
+    assert invoke(*render).exit_code == 0
+    before = sorted(p.name for p in out.iterdir())
+    assert invoke(*render, "--set", "window.min_area_px=2000").exit_code != 0
+    assert sorted(p.name for p in out.iterdir()) == before
+
+
+def test_an_export_that_would_replace_something_says_so_at_once(tmp_path):
+    there = tmp_path / "out.h5"
+    there.write_text("mine")
+    result = invoke("export", tmp_path / "shards", there)
+    assert result.exit_code == 1
+    assert "add --overwrite to replace it" in error_line(result)
+    assert there.read_text() == "mine"

@@ -58,9 +58,18 @@ def test_one_bad_mesh_stops_with_its_name_or_is_left_out(tug_ply, tmp_path, capl
 def test_folders_without_meshes_are_named(tmp_path):
     with pytest.raises(ConfigError, match=f"--occluders {tmp_path}: no mesh in this folder"):
         find_meshes(tmp_path, "mm", "--occluders")
-    (tmp_path / "models_info.json").write_text("{}")
-    with pytest.raises(ConfigError, match=r"no obj_XXXXXX\.ply"):
+    (tmp_path / "models_info.json").write_text('{"1": {}}')
+    with pytest.raises(ConfigError, match=r"has object numbers and there is no obj_XXXXXX\.ply"):
         find_meshes(tmp_path, "mm", "--object")
+
+
+def test_a_folder_may_know_symmetries_by_its_meshes_names(tug_ply):
+    sources = Sources(objects=(tug_ply.parent,))
+    meshes = sources.meshes()
+    assert [Path(m.path).name for m in meshes.values()] == ["bobbin.ply", "tug.ply"]
+    infos = sources.infos(meshes)
+    assert infos[1].is_symmetric
+    assert not infos[2].is_symmetric
 
 
 def test_a_missing_texture_falls_back_only_when_told_to(tmp_path):
@@ -70,7 +79,7 @@ def test_a_missing_texture_falls_back_only_when_told_to(tmp_path):
     (tmp_path / "a.mtl").write_text("newmtl skin\nKd 1.0 0.5 0.0\nmap_Kd lost.png\n")
     given = {"objects": (tmp_path / "a.obj",), "occluders": tmp_path / "a.obj"}
     for load in ("meshes", "assets"):
-        with pytest.raises(MeshError, match=r"texture .*lost\.png is missing"):
+        with pytest.raises(MeshError, match=r"texture .*lost\.png is missing.*--allow-missing-textures"):
             getattr(Sources(**given), load)()
     allowed = Sources(**given, allow_missing_textures=True)
     assert allowed.meshes()[1].texture_rgb is None

@@ -9,6 +9,10 @@ class MeshError(PoseError, ValueError):
     """A mesh file cannot be used."""
 
 
+class TextureError(MeshError):
+    """A file that a mesh's material names is missing."""
+
+
 class CameraError(PoseError, ValueError):
     """A camera matrix or image size is not one."""
 

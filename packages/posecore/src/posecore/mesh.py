@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from posecore.errors import MeshError
+from posecore.errors import MeshError, TextureError
 from posecore.files import write_atomic
 from posecore.ply import refuse_broken_ply
 
@@ -235,7 +235,7 @@ def _refuse_missing_texture(file: Path) -> None:
     except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:  # a name that no file can have
         raise MeshError(f"{file}: it names its texture in a way that cannot be read; export it again") from error
     if missing:
-        raise MeshError(f"{file}: its texture {missing[0]} is missing; put it beside the mesh")
+        raise TextureError(f"{file}: its texture {missing[0]} is missing; put it beside the mesh")
     for texture in textures:
         if not cv2.haveImageReader(str(texture)):
             raise MeshError(f"{file}: its texture {texture} is not an image; export it again")
@@ -258,7 +258,7 @@ def _textures(file: Path) -> list[Path]:
             continue
         material = file.parent / line.split(maxsplit=1)[1].strip()
         if not material.is_file():
-            raise MeshError(f"{file}: its material file {material} is missing; put it beside the mesh")
+            raise TextureError(f"{file}: its material file {material} is missing; put it beside the mesh")
         entries = material.read_text(errors="replace").splitlines()
         found += [file.parent / e.split(maxsplit=1)[1].strip() for e in entries if e.strip().startswith("map_Kd ")]
     return found

@@ -193,11 +193,16 @@ def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, Array]]]:
         yield shard_id, reader.read(shard_id)
 
 
+def refuse_existing(out: Path, overwrite: bool) -> None:
+    """Raise a StorageError when there is something under a name that is not to be replaced."""
+    if out.exists() and not overwrite:
+        raise StorageError(f"{out}: exists; choose another name, or add --overwrite to replace it")
+
+
 @contextmanager
 def _whole(out: Path, overwrite: bool) -> Iterator[Path]:
     """A temporary name beside `out` that takes its place when all went well, and goes away otherwise."""
-    if out.exists() and not overwrite:
-        raise StorageError(f"{out}: exists; choose another name, or add --overwrite to replace it")
+    refuse_existing(out, overwrite)
     if out.is_dir() and not (out / "card.json").is_file() and any(out.iterdir()):
         raise StorageError(f"{out}: a folder that no export made, so it is not replaced; choose another name")
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")

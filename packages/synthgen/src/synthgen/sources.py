@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from posecore.bop import ModelInfo
-from posecore.errors import ConfigError, MeshError
+from posecore.bop.jsonfile import read_json
+from posecore.errors import ConfigError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
 
 from synthgen.assets import Assets
@@ -32,7 +33,7 @@ class Sources:
         backgrounds: Folder of photographs.
         hdris: Folder of panoramas.
         occluders: Folder of meshes, or one mesh.
-        models_info: BOP file to take symmetries from; without it that of a BOP folder among `objects`.
+        models_info: BOP file to take symmetries from; without it those of folders among `objects`.
         allow_missing_textures: Whether a mesh whose texture is missing has its plain colours instead.
         skip_bad_objects: Whether an object that cannot be loaded is left out.
     """
@@ -57,7 +58,7 @@ class Sources:
         loaded, bad = {}, []
         for obj_id, (path, units) in zip(object_ids([str(path) for path, _ in files]), files, strict=True):
             try:
-                loaded[obj_id] = load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
+                loaded[obj_id] = self._load(path, units)
             except MeshError as error:
                 if not self.skip_bad_objects:
                     hint = "; repair it or leave it out with --skip-bad-objects" if len(files) > 1 else ""
@@ -79,11 +80,14 @@ class Sources:
         return Assets(
             photos=list_photos(self.backgrounds.resolve()) if self.backgrounds is not None else (),
             hdris=list_hdris(self.hdris.resolve()) if self.hdris is not None else (),
-            occluders=tuple(
-                load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
-                for path, units in occluders
-            ),
+            occluders=tuple(self._load(path, units) for path, units in occluders),
         )
+
+    def _load(self, path: Path, units: Units) -> Mesh:
+        try:
+            return load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
+        except TextureError as error:
+            raise MeshError(f"{error}, or add --allow-missing-textures for plain colours") from error
 
     def infos(self, meshes: Mapping[int, Mesh]) -> dict[int, ModelInfo]:
         """Symmetries of the objects.
@@ -104,8 +108,8 @@ class Sources:
 def find_meshes(given: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:
     """Mesh files that a path stands for, sorted by name, with their units.
 
-    A folder that holds `models_info.json` is a BOP models folder: its obj_XXXXXX.ply files, in mm. Any other folder
-    stands for all meshes in it and below.
+    A folder that holds `models_info.json` and obj_XXXXXX.ply files is a BOP models folder: those files, in mm. Any other
+    folder stands for all meshes in it and below; a `models_info.json` in it has their names as keys.
 
     Args:
         given: File or folder.
@@ -113,17 +117,19 @@ def find_meshes(given: Path, units: Units, option: str) -> Sequence[tuple[Path, 
         option: Named in messages.
 
     Raises:
-        ConfigError: A folder without meshes.
+        ConfigError: A folder without meshes, or with the numbers of BOP objects and without their files.
     """
     if not given.is_dir():
         return [(given, units)]
     if (given / MODELS_INFO).is_file():
         models = [p for p in sorted(given.glob("*.ply")) if re.fullmatch(r"obj_\d+", p.stem)]
-        if not models:
+        if models:
+            return [(path, "mm") for path in models]
+        if any(key.isdigit() for key in read_json(given / MODELS_INFO)):
             raise ConfigError(
-                f"{option} {given}: has {MODELS_INFO} and no obj_XXXXXX.ply, expected a BOP models folder"
+                f"{option} {given}: {MODELS_INFO} has object numbers and there is no obj_XXXXXX.ply; name the meshes "
+                "like that, or let its keys be their names"
             )
-        return [(path, "mm") for path in models]
     found = sorted(p for p in given.rglob("*") if p.suffix.lower() in MESH_SUFFIXES)
     if not found:
         raise ConfigError(f"{option} {given}: no mesh in this folder, expected {', '.join(MESH_SUFFIXES)} files")

@@ -31,8 +31,9 @@ def export(shards: str, out: Path, layout: str, overwrite: bool, quiet: bool) ->
     """
     from posecore.shard import ShardReader
 
-    from synthgen.export import to_hdf5, to_webdataset
+    from synthgen.export import refuse_existing, to_hdf5, to_webdataset
 
+    refuse_existing(out, overwrite)
     n = ShardReader(shards).n
     with progress_bar(quiet) as bar:
         task = bar.add_task("pairs", total=n)

@@ -1,7 +1,10 @@
 """`synthgen render`."""
 
 import os
+import shutil
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +111,8 @@ def render(
     if only is not None:
         _one_sample(out, ShardJob(config=config, card=card, meshes=meshes, assets=assets, threads=cores), only, save)
         return
-    with lock.held(out), stoppable(out):
+    new = "://" not in out and not Path(out).exists()
+    with lock.held(out), stoppable(out), _leaving_nothing_useless(Path(out) if new else None):
         writer = ShardWriter.create(out, card)
         for key, data in dataset.model_files(meshes, sources.infos(meshes)).items():
             writer.add_file(key, data)
@@ -144,6 +148,26 @@ def render(
         scenes = writer.quarantined()
         replaced = f", {len(scenes)} scenes quarantined and drawn anew" if scenes else ""
         click.echo(f"{out}: complete, {total} pairs{replaced}", err=True)
+
+
+@contextmanager
+def _leaving_nothing_useless(new: Path | None) -> Iterator[None]:
+    """Remove a new folder when an error ends the command before the first shard is there.
+
+    Its data card would refuse the same command with the mended setting.
+
+    Args:
+        new: A folder that was not there before the command; None when it was.
+    """
+    from posecore.errors import PoseError
+    from posecore.shard.group import MANIFEST
+
+    try:
+        yield
+    except PoseError:
+        if new is not None and not (new / MANIFEST).exists():
+            shutil.rmtree(new, ignore_errors=True)
+        raise
 
 
 def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> str:
