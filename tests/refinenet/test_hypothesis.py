@@ -9,6 +9,7 @@ from refinenet import augment
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig, load_config
 from refinenet.hypothesis import PairMaker, draw_hypothesis
 from refinenet.recut import optical_axis_turn, recut_affine, warp
+from refinenet.visibility import visible_overlap, visible_share
 
 
 @pytest.fixture(scope="module")
@@ -118,12 +119,54 @@ def test_background_exchange_keeps_the_object(mesh, rasteriser, samples):
     assert same[~truth].mean() < 0.3
 
 
+def test_occluders_hide_part_of_the_object_and_nothing_else(mesh, rasteriser, samples):
+    """The visible share falls, never under its limit; pixels and masks change together; truth and contour stay."""
+    plain = make_pairs(mesh, rasteriser, samples, fresh=True)
+    config = AugmentConfig(occlusion=1.0, occlusion_leaves=0.4)
+    covered = make_pairs(mesh, rasteriser, samples, fresh=True, augment_config=config)
+    assert (plain.visible_share == 1).all()
+    assert (covered.visible_share >= 0.4).all()
+    assert (covered.visible_share < 0.98).sum() >= 4
+    changed = (plain.scene_rgb != covered.scene_rgb).any(axis=-1)
+    over = (covered.scene_bits & 4 > 0) & (covered.scene_bits & 2 == 0)
+    assert not (changed & ~over).any()
+    np.testing.assert_array_equal(covered.scene_bits & 1, plain.scene_bits & 1)
+    np.testing.assert_array_equal(covered.scene_distance_px, plain.scene_distance_px)
+
+
+def test_fixed_windows_keep_their_side_in_the_image(mesh, rasteriser, samples):
+    maker = PairMaker(
+        meshes={1: mesh}, rasteriser=rasteriser, patch_px=64, window=WindowConfig(kind="fixed"), contour_points=32,
+        hypothesis=HypothesisConfig(fresh=True), augment_config=AugmentConfig(), fixed_sides_px={1: 188.0},
+    )  # fmt: skip
+    pairs = maker(samples, [np.random.default_rng([0, i]) for i in range(len(samples))])
+    np.testing.assert_allclose(pairs.K_crop[:, 0, 0], samples[0]["K"][0, 0] * 64 / 188)
+
+
+def test_overlap_is_one_at_the_truth_whatever_covers_it_and_zero_apart():
+    """Bits: 1 the object, 2 its visible part, 4 the foreground."""
+    bits = np.zeros((8, 8), np.uint8)
+    bits[2:6, 2:6] = 1 | 2 | 4
+    truth = bits > 0
+    apart = np.roll(truth, 4, axis=1) & ~truth
+    assert visible_overlap(truth, bits) == 1
+    assert visible_overlap(np.roll(truth, 2, axis=0), bits) == pytest.approx(8 / 24)
+    bits[2:6, 2:4] = 1 | 4
+    assert visible_share(bits) == 0.5
+    assert visible_overlap(truth, bits) == 1
+    assert visible_overlap(apart, bits) == 0
+    bits[2:6, 2:6] = 1 | 4
+    assert visible_overlap(truth, bits) == 0
+    assert visible_share(np.zeros((3, 8, 8), np.uint8)).tolist() == [0, 0, 0]
+
+
 def test_colour_augmentation_keeps_black_and_moves_both_patches_together():
     rng = np.random.default_rng(0)
     hypothesis = np.zeros((6, 16, 16, 3), np.uint8)
     hypothesis[:, 4:12, 4:12] = [200, 100, 20]
     config = AugmentConfig(permute_channels=1.0)
-    scene, render, _ = augment.colour(hypothesis, hypothesis, config, rng)
+    scene, render, colours = augment.colour(hypothesis, hypothesis, config, rng)
+    np.testing.assert_allclose(np.einsum("bij,bhwj->bhwi", colours, hypothesis), render)
     np.testing.assert_array_equal(scene, render)
     assert (render[:, 0, 0] == 0).all()
     assert len(np.unique(render[:, 8, 8], axis=0)) > 1

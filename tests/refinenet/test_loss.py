@@ -148,6 +148,20 @@ def test_distance_is_bilinear_between_pixel_centres():
     torch.testing.assert_close(loss.sample_distance(distance, uv), expected)
 
 
+def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
+    """Added to any loss where there is a confidence; least where its sigmoid is the overlap."""
+    b = len(shifted.K_crop)
+    target = shifted._replace(overlap=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
+    logits = torch.zeros(b, requires_grad=True)
+    chosen = loss.make_loss("contour", gamma=1, point_weight=1, confidence_weight=2, objects=object_points(mesh))
+    plain, still = loss.contour_loss_px(identity(target), target), identity(target)
+    with_logits = chosen(still._replace(confidence=logits), target)
+    torch.testing.assert_close(chosen(still, target), plain)
+    torch.testing.assert_close((with_logits - plain).float(), torch.full((b,), 2 * float(np.log(2))))
+    (gradient,) = torch.autograd.grad(with_logits.sum(), logits)
+    torch.testing.assert_close(gradient, 2 * (0.5 - target.overlap))
+
+
 def test_outside_the_patch_the_distance_grows_with_the_way_back():
     distance = torch.full((1, 8, 8), 2.0, dtype=torch.float64)
     uv = torch.tensor([[[-99.5, 4.0], [4.0, 107.5], [-2.5, -3.5]]], dtype=torch.float64, requires_grad=True)
@@ -159,7 +173,7 @@ def test_outside_the_patch_the_distance_grows_with_the_way_back():
 
 @pytest.mark.parametrize("name", loss.LOSSES)
 def test_gradcheck(mesh, turned, name):
-    few = Target(*(None if x is None else x[:2] for x in turned))
+    few = turned.mapped(lambda x: x[:2])
     chosen = loss.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
     generator = torch.manual_seed(0)
     quat = torch.tensor([[1.0, 0.02, 0.03, -0.01]] * 2, dtype=torch.float64).requires_grad_()

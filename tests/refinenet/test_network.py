@@ -2,12 +2,13 @@ import logging
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from posecore.errors import CheckpointError, ConfigError
-from refinenet import backbone, geometry
+from refinenet import backbone, checkpoint, geometry
 from refinenet.config import load_config
 from refinenet.network import CompactNet, Pair, PaperNet, make_network
 from refinenet.refine import STOP_ANGLE_DEG, STOP_DISTANCE_M
@@ -28,6 +29,7 @@ def make_pair(patch_px, b=2, seed=0):
     [
         ("paper", STOP_ANGLE_DEG, STOP_DISTANCE_M),  # so a refiner would stop at once
         ("compact", 6.0, 0.01),  # its heads start five times wider, which learns faster
+        ("plus", 6.0, 0.01),
     ],
 )
 def test_an_untrained_network_returns_its_input_pose(preset, angle_deg, distance_m):
@@ -63,6 +65,49 @@ def test_the_stem_stays_frozen_in_training_mode():
     assert all(torch.equal(before[name], value) for name, value in network.stem.state_dict().items())
     assert all(p.grad is None for p in network.stem.parameters())
     assert network.translation.head.weight.grad is not None
+
+
+@pytest.mark.parametrize("preset", ["compact", "paper", "plus"])
+@pytest.mark.parametrize("rotation", ["6d", "quaternion"])
+@pytest.mark.parametrize("translation", ["crop", "camera"])
+def test_every_head_starts_at_the_identity(preset, rotation, translation):
+    """Weights at zero, so that the biases alone speak."""
+    switches = [f"network.rotation={rotation}", f"network.translation={translation}", "network.confidence=true"]
+    network = make_network(load_config(preset, switches).network).eval()
+    pair = make_pair(network.patch_px)
+    for name, weight in network.named_parameters():
+        if name.split(".")[0] in ("rotation", "translation", "confidence") and name.endswith(
+            ("head.weight", ".weight")
+        ):
+            torch.nn.init.zeros_(weight)
+    with torch.no_grad():
+        update = network(pair)
+    torch.testing.assert_close(update.dR, torch.eye(3).repeat(2, 1, 1), atol=1e-5, rtol=0)
+    torch.testing.assert_close(update.dt, torch.zeros(2, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(update.confidence, torch.zeros(2))
+
+
+@pytest.mark.parametrize("preset", ["paper", "compact"])
+def test_networks_without_a_confidence_say_so(preset):
+    network = make_network(load_config(preset).network).eval()
+    with torch.no_grad():
+        assert network(make_pair(network.patch_px)).confidence is None
+
+
+def test_plus_gives_every_weight_a_gradient():
+    network = make_network(load_config("plus").network)
+    update = network(make_pair(128))
+    (update.dt.square().sum() + (update.dR - torch.eye(3)).square().sum() + update.confidence.sum()).backward()
+    assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
+
+
+def test_the_shipped_checkpoint_still_loads():
+    path = Path(__file__).parents[2] / "examples" / "checkpoints" / "tug_compact.safetensors"
+    network = checkpoint.load(path, "compact").network()
+    with torch.no_grad():
+        update = network(make_pair(64))
+    assert torch.isfinite(update.dt).all()
+    assert update.confidence is None
 
 
 def test_compact_is_small_and_every_weight_gets_a_gradient():
@@ -124,6 +169,53 @@ def test_inception_v3_weights_load_and_see(shared_data):
     norm = stem.Mixed_5d.branch1x1.bn
     means = seen[0].mean(dim=(0, 2, 3))
     assert np.corrcoef(means.numpy(), norm.running_mean.numpy())[0, 1] > 0.9
+
+
+GOLDEN = {
+    (0, 0, 0): 3.98673, (31, 5, 7): 0.22769, (63, 12, 12): 1.86396, (70, 3, 20): 1.00207, (127, 24, 24): 1.60818,
+    (200, 11, 2): 0.53545, (240, 0, 24): 1.88591, (287, 13, 1): 0.77205, (140, 9, 9): 0.0,
+}  # fmt: skip
+"""Mixed_5d of torchvision 0.28.0's Inception3 with the shared weights and `golden_input`; by channel, row, column."""
+GOLDEN_MEANS = (0.74412, 0.42163, 0.33179, 0.3538, 0.30087, 0.36323, 0.28073, 0.17963, 0.24319)
+"""Means of each 32 channels, likewise."""
+
+
+def golden_input():
+    y, x = torch.meshgrid(torch.arange(224.0), torch.arange(224.0), indexing="ij")
+    waves = (torch.sin(0.11 * x + 0.05 * y), torch.cos(0.07 * y) * torch.sin(0.03 * x))
+    return torch.stack([*waves, ((x * y / 224) % 29) / 14.5 - 1])[None]
+
+
+def real_inception_v3(shared_data):
+    path = shared_data / "weights" / "inception_v3_stem.safetensors"
+    if not path.is_file():
+        pytest.skip(f"no weights at {path}")
+    stem = backbone.make_stem("inception_v3")
+    backbone.load_weights(stem, path)
+    return stem
+
+
+def test_inception_v3_gives_torchvisions_features(shared_data):
+    with torch.no_grad():
+        features = real_inception_v3(shared_data)(golden_input())[0]
+    for where, value in GOLDEN.items():
+        assert float(features[where]) == pytest.approx(value, abs=2e-4)
+    np.testing.assert_allclose(features.mean(dim=(1, 2)).reshape(9, 32).mean(1), GOLDEN_MEANS, atol=1e-4)
+
+
+def test_inception_v3_against_torchvision(shared_data):
+    inception = pytest.importorskip(
+        "torchvision.models.inception", reason="torchvision is the oracle of this test only"
+    )
+    stem = real_inception_v3(shared_data)
+    oracle = inception.Inception3(init_weights=False, aux_logits=False).eval()
+    unknown = oracle.load_state_dict(stem.state_dict(), strict=False).unexpected_keys
+    assert not unknown
+    seen = []
+    oracle.Mixed_5d.register_forward_hook(lambda _, __, output: seen.append(output))
+    with torch.no_grad():
+        oracle(golden_input())
+        torch.testing.assert_close(stem(golden_input()), seen[0])
 
 
 def test_wrong_weights_are_refused_by_name(tmp_path):

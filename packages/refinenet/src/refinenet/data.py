@@ -57,7 +57,7 @@ class Batch(NamedTuple):
     def to(self, device: torch.device) -> "Batch":
         """The same on another device; copies from pinned memory are only queued."""
         pair = Pair(*(x.to(device, non_blocking=True) for x in self.pair))
-        target = Target(*(None if x is None else x.to(device, non_blocking=True) for x in self.target))
+        target = self.target.mapped(lambda x: x.to(device, non_blocking=True))
         return self._replace(pair=pair, target=target)
 
 
@@ -100,7 +100,7 @@ class PairSource:
         Raises:
             ShardError: One cannot be read, without that setting.
         """
-        fields = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
+        fields: tuple[str, ...] = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
         if self._rasteriser is None and self._config.network.confidence:
             fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:

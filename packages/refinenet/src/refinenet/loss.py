@@ -38,6 +38,10 @@ class Target(NamedTuple):
     scene_bits: UInt8[Tensor, "b p p"] | None = None
     overlap: Float[Tensor, " b"] | None = None
 
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Target":
+        """Every field that is there, changed."""
+        return Target(*(x if x is None else change(x) for x in self))  # type: ignore[arg-type]
+
 
 class ObjectPoints(NamedTuple):
     """Model points and symmetries of every object, padded to one shape.

@@ -54,15 +54,19 @@ def measure(
     """Errors before and after one update: mean of each, and the rotation's median.
 
     Keys: validation/rotation_before_deg, validation/rotation_after_deg, validation/rotation_median_after_deg,
-    validation/x_before_mm and so on.
+    validation/x_before_mm and so on; from a network with that output also validation/confidence_error, the mean
+    distance of its confidence from the visible overlap of each start.
     """
     was_training = network.training
     network.eval()
     collected: dict[str, list[Tensor]] = {}
     for batch in batches:
         batch = batch.to(device)
-        start = batch.pair.T_cam_obj
-        for when, pose in (("before", start), ("after", geometry.apply_update(start, network(batch.pair)))):
+        start, update = batch.pair.T_cam_obj, network(batch.pair)
+        if update.confidence is not None and batch.target.overlap is not None:
+            off = (torch.sigmoid(update.confidence) - batch.target.overlap).abs()
+            collected.setdefault("validation/confidence_error", []).append(off.cpu())
+        for when, pose in (("before", start), ("after", geometry.apply_update(start, update))):
             errors = pose_errors(pose, batch.target.T_cam_obj, batch.target.object_index, objects)
             for name, values in errors.items():
                 what, unit = name.rsplit("_", 1)

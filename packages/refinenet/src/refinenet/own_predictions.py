@@ -7,11 +7,12 @@ are resampled, and what lies beyond the old patch is mirrored, so that no edge s
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from types import TracebackType
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from posecore import contour, se3
 from posecore.camera import crop_K
 from posecore.mesh import Mesh
@@ -41,6 +42,24 @@ def share_at(config: OwnPredictionsConfig, step: int, steps: int) -> float:
     return config.share * (float(np.clip(done / span, 0, 1)) if span > 0 else float(done >= 0))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Looks:
+    """Poses that can be seen through windows of their own, cut from old patches.
+
+    `kept` are their rows, `uv_px` where in the old patch the new one's pixels lie, `scale` new pixels per old one.
+    """
+
+    kept: Int[Array, " s"]
+    T_cam_obj: Float[Array, "s 4 4"]
+    K_crop: Float[Array, "s 3 3"]
+    rgb: UInt8[Array, "s p p 3"]
+    depth_m: Float[Array, "s p p"]
+    outline: Bool[Array, "s p p"]
+    bits: UInt8[Array, "s p p"]
+    uv_px: Float[Tensor, "s p p 2"]
+    scale: Float[Array, " s"]
+
+
 class OwnPredictions:
     """Replaces part of a batch by pairs that start from the network's own predictions.
 
@@ -51,10 +70,13 @@ class OwnPredictions:
         config: Of the run.
         meshes: By object id.
         rank: Of this process.
+        reduced: Let the network's convolutions run in bfloat16.
     """
 
-    def __init__(self, config: TrainConfig, meshes: Mapping[int, Mesh], rank: int = 0) -> None:
-        self._config, self._meshes, self._rank = config, dict(meshes), rank
+    def __init__(
+        self, config: TrainConfig, meshes: Mapping[int, Mesh], rank: int = 0, *, reduced: bool = False
+    ) -> None:
+        self._config, self._meshes, self._rank, self._reduced = config, dict(meshes), rank, reduced
         self._obj_ids = sorted(self._meshes)  # rows of `ObjectPoints`
         self._rasteriser: Rasteriser | None = None
 
@@ -105,68 +127,79 @@ class OwnPredictions:
     ) -> tuple[Batch, Int[Array, " s"]]:
         """The batch after one update of some rows, and those of them that could be looked at where they went."""
         chosen = torch.from_numpy(rows).to(batch.sample_ids.device)
-        pair, target = Pair(*(x[chosen] for x in batch.pair)), _rows(batch.target, chosen)
-        T = geometry.apply_update(pair.T_cam_obj, network(pair)).double().cpu().numpy()
+        pair = Pair(*(x[chosen] for x in batch.pair))
+        with torch.autocast(chosen.device.type, torch.bfloat16, enabled=self._reduced):
+            update = network(pair)
+        T = geometry.apply_update(pair.T_cam_obj, update).double().cpu().numpy()
         fits = np.isfinite(T).all(axis=(1, 2))
         T[fits, :3, :3] = se3.nearest_rotation(T[fits, :3, :3])  # float32 products are not quite rotations
-        K = pair.K_crop.double().cpu().numpy()
-        index = target.object_index.cpu().numpy()
-        windows = [self._window(K[i], T[i], int(index[i])) for i in range(len(rows))]
-        fine = [i for i, window in enumerate(windows) if window is not None]
-        seen = [window for window in windows if window is not None]
-        if not seen:
+        looks = self._look(T, pair.K_crop, batch.target.mapped(lambda x: x[chosen]))
+        if looks is None:
             return batch, rows[:0]
-        at = torch.tensor(fine, device=chosen.device)
-        uv = _grid(seen, self._config.network.patch_px, chosen.device)
-        bits = _resampled(_known(target.scene_bits)[at, None].float(), uv, "nearest")[:, 0].byte()
+        where = chosen[torch.from_numpy(looks.kept).to(chosen.device)]
+        colours = None if batch.render_colours is None else batch.render_colours[rows[looks.kept]]
+        new = self._pairs(looks, Pair(*(x[where] for x in batch.pair)), batch.target.mapped(lambda x: x[where]), rng)
+        new = new._replace(pair=new.pair._replace(hypothesis_rgb=_tinted(looks.rgb, colours).to(chosen.device)))
+        pairs = Pair(*(x.index_copy(0, where, y) for x, y in zip(batch.pair, new.pair, strict=True)))
+        fields = {
+            name: x if x is None else x.index_copy(0, where, y)
+            for (name, x), y in zip(batch.target._asdict().items(), new.target, strict=True)
+        }
+        return batch._replace(pair=pairs, target=batch.target._replace(**fields)), rows[looks.kept]
+
+    def _look(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: Target) -> _Looks | None:
+        """What poses look like through windows of their own; None where none of them can be seen."""
+        assert target.scene_bits is not None  # every stream fills it
+        K, index = K_crop.double().cpu().numpy(), target.object_index.cpu().numpy()
+        windows = {i: self._window(K[i], T[i], int(index[i])) for i in range(len(T))}
+        drawn = np.array([i for i, window in windows.items() if window is not None], np.int64)
+        if not len(drawn):
+            return None
+        cut = [window for window in windows.values() if window is not None]
         patch_px = self._config.network.patch_px
-        K_new = np.stack([crop_K(K[i], window, patch_px) for i, window in zip(fine, seen, strict=True)])
-        rgb, depth = self._render(index[fine], K_new, T[fine])
-        host_bits = bits.cpu().numpy()
-        outlines = [contour.contour_mask(d > 0) for d in depth]
-        good = [
-            j
-            for j, outline in enumerate(outlines)
-            if min(outline.sum(), ((host_bits[j] & BIT_OBJECT) > 0).sum()) >= MIN_CONTOUR_PX
-        ]
-        if not good:
-            return batch, rows[:0]
-        kept = np.array([fine[j] for j in good])
-        where, uv, side = chosen[at[good]], uv[good], torch.tensor([seen[j].side_px for j in good])
-        scale = (patch_px / side).to(uv)[:, None, None]
-        distance = sample_distance(target.scene_distance_px[at[good]], uv.flatten(1, 2))
-        n = target.hypothesis_contour_m.shape[1]
-        points = [contour.sample_contour(depth[j] > 0, depth[j], K_new[j], n, rng) for j in good]
+        K_new = np.stack([crop_K(K[i], window, patch_px) for i, window in zip(drawn, cut, strict=True)])
+        rgb, depth = self._render(index[drawn], K_new, T[drawn])
+        uv = _grid(cut, patch_px).to(K_crop.device)
+        bits = _resampled(target.scene_bits[torch.from_numpy(drawn).to(uv.device), None].float(), uv, "nearest")[:, 0]
+        host_bits = bits.byte().cpu().numpy()
+        outlines = np.stack([contour.contour_mask(d > 0) for d in depth])
+        shown = np.minimum(outlines.sum(axis=(1, 2)), ((host_bits & BIT_OBJECT) > 0).sum(axis=(1, 2)))
+        good = np.flatnonzero(shown >= MIN_CONTOUR_PX)
+        if not len(good):
+            return None
+        return _Looks(
+            kept=drawn[good], T_cam_obj=T[drawn][good], K_crop=K_new[good], rgb=rgb[good], depth_m=depth[good],
+            outline=outlines[good], bits=host_bits[good], uv_px=uv[torch.from_numpy(good).to(uv.device)],
+            scale=np.array([patch_px / cut[j].side_px for j in good]),
+        )  # fmt: skip
+
+    def _pairs(self, looks: _Looks, pair: Pair, target: Target, rng: np.random.Generator) -> Batch:
+        """The pairs of what was looked at, made of the old ones; renders' colours are as drawn."""
 
         def real(values: Array | list[Array]) -> Tensor:
-            return torch.from_numpy(np.asarray(values, np.float32)).to(chosen.device)
+            return torch.from_numpy(np.asarray(values, np.float32)).to(pair.K_crop.device)
 
-        tinted = self._tinted(rgb[good], batch.render_colours, rows[kept])
-        scene = _resampled(pair.scene_rgb[at[good]].float(), uv, "bilinear")
-        T_new, K_good = real(T[kept]), real(K_new[good])
-        overlap = visible_overlap(depth[good] > 0, host_bits[good])
-        new_pair = Pair((scene + 0.5).clamp(0, 255).byte(), tinted.to(chosen.device), T_new, K_good)
+        patch_px, n = self._config.network.patch_px, target.hypothesis_contour_m.shape[1]
+        masks = looks.depth_m > 0
+        points = [
+            contour.sample_contour(masks[j], looks.depth_m[j], looks.K_crop[j], n, rng) for j in range(len(masks))
+        ]
+        scene = _resampled(pair.scene_rgb.float(), looks.uv_px, "bilinear")
+        distance = sample_distance(target.scene_distance_px, looks.uv_px.flatten(1, 2))
+        new_pair = Pair(
+            scene_rgb=(scene + 0.5).clamp(0, 255).byte(), hypothesis_rgb=pair.hypothesis_rgb,
+            T_cam_obj=real(looks.T_cam_obj), K_crop=real(looks.K_crop),
+        )  # fmt: skip
         new_target = target._replace(
-            T_cam_obj=target.T_cam_obj[at[good]],
-            T_cam_obj_hypothesis=T_new,
-            K_crop=K_good,
-            scene_contour_m=target.scene_contour_m[at[good]],
+            T_cam_obj_hypothesis=new_pair.T_cam_obj,
+            K_crop=new_pair.K_crop,
             hypothesis_contour_m=real(points),
-            scene_distance_px=distance.unflatten(1, (patch_px, patch_px)) * scale,
-            hypothesis_distance_px=real([contour.distance_transform_px(outlines[j]) for j in good]),
-            object_index=target.object_index[at[good]],
-            scene_bits=bits[good],
-            overlap=None if target.overlap is None else real(overlap),
+            scene_distance_px=distance.unflatten(1, (patch_px, patch_px)) * real(looks.scale)[:, None, None],
+            hypothesis_distance_px=real([contour.distance_transform_px(outline) for outline in looks.outline]),
+            scene_bits=torch.from_numpy(looks.bits).to(pair.K_crop.device),
+            overlap=None if target.overlap is None else real(visible_overlap(masks, looks.bits)),
         )
-        return batch._replace(
-            pair=Pair(*(x.index_copy(0, where, y) for x, y in zip(batch.pair, new_pair, strict=True))),
-            target=Target(
-                *(
-                    None if x is None or y is None else x.index_copy(0, where, y)
-                    for x, y in zip(batch.target, new_target, strict=True)
-                )
-            ),
-        ), rows[kept]
+        return Batch(new_pair, new_target, torch.from_numpy(looks.kept))
 
     def _window(self, K_patch: Float[Array, "3 3"], T: Float[Array, "4 4"], index: int) -> Window | None:
         """Window of a pose in the old patch's pixels; None where it cannot be drawn or has left the patch."""
@@ -192,31 +225,22 @@ class OwnPredictions:
             rgb[rows], depth[rows] = layers.rgb, layers.depth_m
         return rgb, depth
 
-    @staticmethod
-    def _tinted(rgb: UInt8[Array, "s p p 3"], colours: Tensor | None, rows: Int[Array, " s"]) -> Tensor:
-        """Renders with the colours that the batch's augmentation gave theirs, channels first."""
-        values = torch.from_numpy(rgb.astype(np.float32)).permute(0, 3, 1, 2)
-        if colours is not None:
-            values = torch.einsum("bij,bjhw->bihw", colours.cpu()[rows], values)
-        return (values + 0.5).clamp(0, 255).byte()
+
+def _tinted(rgb: UInt8[Array, "s p p 3"], colours: Float[Tensor, "s 3 3"] | None) -> UInt8[Tensor, "s 3 p p"]:
+    """Renders with the colours that the batch's augmentation gave theirs."""
+    values = torch.from_numpy(rgb.astype(np.float32)).permute(0, 3, 1, 2)
+    if colours is not None:
+        values = torch.einsum("bij,bjhw->bihw", colours, values)
+    return (values + 0.5).clamp(0, 255).byte()
 
 
-def _rows(target: Target, rows: Tensor) -> Target:
-    return Target(*(None if x is None else x[rows] for x in target))
-
-
-def _known(bits: Tensor | None) -> Tensor:
-    assert bits is not None  # every stream fills it
-    return bits
-
-
-def _grid(windows: list[Window], patch_px: int, device: torch.device) -> Float[Tensor, "s p p 2"]:
+def _grid(windows: list[Window], patch_px: int) -> Float[Tensor, "s p p 2"]:
     """Where in the old patch each pixel centre of the new one lies, continuous pixels."""
     centre = (np.arange(patch_px) + 0.5) / patch_px
     v, u = np.meshgrid(centre, centre, indexing="ij")
     unit = np.stack([u, v], axis=-1)
     uv = np.stack([unit * window.side_px + (window.x0_px, window.y0_px) for window in windows])
-    return torch.from_numpy(uv.astype(np.float32)).to(device)
+    return torch.from_numpy(uv.astype(np.float32))
 
 
 def _resampled(values: Float[Tensor, "s c p p"], uv: Float[Tensor, "s p p 2"], mode: str) -> Float[Tensor, "s c p p"]:

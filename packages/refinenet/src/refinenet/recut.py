@@ -1,6 +1,7 @@
 """Windows of hypotheses, and the map that cuts a stored scene patch anew for one of them."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +31,7 @@ def hypothesis_window(
     return diameter_window(K, T_cam_obj, mesh.center_m, mesh.diameter_m, config.scale)
 
 
-def fixed_sides_px(objects_card: Mapping[str, Mapping[str, float]]) -> dict[int, float]:
+def fixed_sides_px(objects_card: Mapping[str, Mapping[str, Any]]) -> dict[int, float]:
     """Side of the `fixed` window of every object on a data card, in pixels of the images it was rendered in."""
     return {int(key): float(entry["window_side_px"]) for key, entry in objects_card.items()}
 

@@ -92,7 +92,7 @@ class Trainer:
         self._held_out = self._make_held_out()
         meshes = load_meshes(reader)
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
-        self._own_predictions = OwnPredictions(config, meshes, self.rank)
+        self._own_predictions = OwnPredictions(config, meshes, self.rank, reduced=self._reduced)
         self.objects = points.to(self.device)
         self._dataset_sha256 = _dataset_sha256(reader, config)
         self._objects_card = {
@@ -224,10 +224,9 @@ class Trainer:
         losses = []
         for i, batch in enumerate(batches):
             self._tell_skipped(*batch.skipped)
-            batch = batch.to(self.device)
+            batch = self._own_predictions(self.network, batch.to(self.device), self.step, i)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-                    batch = self._own_predictions(self.network, batch, self.step, i)
                     update = self._predict(batch.pair)
                 losses.append(self._loss(update, batch.target))
                 (losses[-1].mean() / len(batches)).backward()
