@@ -108,7 +108,7 @@ class Sources:
 def find_meshes(given: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:
     """Mesh files that a path stands for, sorted by name, with their units.
 
-    A folder that holds `models_info.json` and obj_XXXXXX.ply files is a BOP models folder: those files, in mm. Any other
+    A folder with `models_info.json` and obj_XXXXXX.ply files is a BOP models folder: those files, in mm. Any other
     folder stands for all meshes in it and below; a `models_info.json` in it has their names as keys.
 
     Args:
