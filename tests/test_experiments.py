@@ -1,6 +1,7 @@
 """Experiments: every command line is one that its command takes, and one experiment runs from end to end."""
 
 import importlib
+import itertools
 import json
 import shlex
 import subprocess
@@ -177,6 +178,26 @@ def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
     assert levels[-1] == 45
     assert all(step["seconds"] > 0 for step in result["steps"])
+
+
+def test_every_method_starts_from_the_same_poses_and_is_in_the_report(tmp_path) -> None:
+    what = common.Comparison(
+        objects="--object a.ply",
+        scenes="",
+        frames=2,
+        networks={"net": common.Network(checkpoint=common.SHIPPED)},
+        baselines=("edge-icp",),
+        starts="--angles 5",
+    )
+    *_, net, edge, tables, report = common.compared(tmp_path, what)
+    options = [dict(zip(step.command[2::2], step.command[3::2], strict=True)) for step in (net, edge)]
+    start = str(tmp_path / "results" / "start.csv")
+    assert [each["--init"] for each in options] == [start, start]
+    assert [each.get("--method") for each in options] == [None, "edge-icp"]
+    assert [each.get("--checkpoint") is None for each in options] == [False, True]
+    for step in (tables, report):
+        named = [word for before, word in itertools.pairwise(step.command) if before == "--results"]
+        assert named == [start, options[0]["--out"], options[1]["--out"]]
 
 
 def test_parts_join_into_one_result_file(tmp_path) -> None:
