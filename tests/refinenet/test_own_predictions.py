@@ -122,6 +122,19 @@ def test_part_of_a_batch_is_replaced_and_the_same_part_again(mesh, batch):
     assert torch.equal(first.pair.hypothesis_rgb[~changed], batch.pair.hypothesis_rgb[~changed])
 
 
+def test_each_object_is_seen_through_its_own_window(mesh, batch):
+    """A category: rows of two objects, the second twice as large, in the order of their ids."""
+    twice = replace(mesh, vertices_m=2 * mesh.vertices_m)
+    index = torch.tensor([0, 1] * 4)
+    mixed = batch._replace(target=batch.target._replace(object_index=index))
+    with OwnPredictions(small(*OWN), {7: twice, 3: mesh}) as own:
+        after = own(Moves(), mixed, step=0)
+    T, K = after.pair.T_cam_obj, after.pair.K_crop
+    across = K[:, 0, 0] * mesh.diameter_m / (T[:, :3, :3] @ torch.from_numpy(mesh.center_m).float() + T[:, :3, 3])[:, 2]
+    assert across[index == 0].numpy() == pytest.approx(64 / 1.5, rel=0.02)
+    assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)
+
+
 def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path):
     everything = small(
         "own_predictions.share=0.5", "own_predictions.begin=0.2", "own_predictions.full=0.5",

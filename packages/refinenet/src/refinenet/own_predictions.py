@@ -141,11 +141,10 @@ class OwnPredictions:
         new = self._pairs(looks, Pair(*(x[where] for x in batch.pair)), batch.target.mapped(lambda x: x[where]), rng)
         new = new._replace(pair=new.pair._replace(hypothesis_rgb=_tinted(looks.rgb, colours).to(chosen.device)))
         pairs = Pair(*(x.index_copy(0, where, y) for x, y in zip(batch.pair, new.pair, strict=True)))
-        fields = {
-            name: x if x is None else x.index_copy(0, where, y)
-            for (name, x), y in zip(batch.target._asdict().items(), new.target, strict=True)
-        }
-        return batch._replace(pair=pairs, target=batch.target._replace(**fields)), rows[looks.kept]
+        old = batch.target
+        both = zip(old, new.target, strict=True)
+        fields = (x if x is None or y is None else x.index_copy(0, where, y) for x, y in both)
+        return batch._replace(pair=pairs, target=Target(*fields)), rows[looks.kept]  # type: ignore[arg-type]
 
     def _look(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: Target) -> _Looks | None:
         """What poses look like through windows of their own; None where none of them can be seen."""
