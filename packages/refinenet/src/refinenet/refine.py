@@ -62,6 +62,8 @@ class Refiner:
     Attributes:
         checkpoint: Checkpoint.
         meshes: Objects by id.
+        viewer: What renders and cuts the patches.
+        device: Where the network runs.
         scorer: Where confidences come from: `learned` where the network has such an output, else `gradient`.
 
     Raises:
@@ -87,11 +89,11 @@ class Refiner:
         self.checkpoint = loaded
         self.meshes = dict(meshes)
         self._iterations = iterations
-        self._device = choose_device(device)
-        self._network = loaded.network().to(self._device)
+        self.device = choose_device(device)
+        self._network = loaded.network().to(self.device)
         self._batch = batch
-        self._viewer = Viewer(meshes, loaded.provenance)
-        self.scorer: Scorer = "learned" if self._predict(*_blank(loaded)).confidence is not None else "gradient"
+        self.viewer = Viewer(meshes, loaded.provenance)
+        self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
 
     @classmethod
     def load(cls, path: str | Path, meshes: Mapping[int, Mesh], **settings: Any) -> "Refiner":
@@ -108,7 +110,7 @@ class Refiner:
 
     def close(self) -> None:
         """Free what the renderer holds."""
-        self._viewer.close()
+        self.viewer.close()
 
     @property
     def name(self) -> str:
@@ -193,19 +195,23 @@ class Refiner:
 
     def _update(self, frame: Frame, batch: _Batch, rows: Int[Array, " a"]) -> None:
         """One update of these rows."""
-        views = self._viewer.look(frame, batch.T[rows], batch.obj_id[rows])
+        views = self.viewer.look(frame, batch.T[rows], batch.obj_id[rows])
         for row, why in zip(rows, views.failures, strict=True):
             batch.failures[row] = why
         if not len(views.rows):
             return
         moved = rows[views.rows]
-        update = self._predict(views, batch.T[moved])
+        batch.T[moved], small = self.moved(views, batch.T[moved])
+        batch.iterations[moved] += 1
+        batch.converged[moved] = small
+
+    def moved(self, views: Views, T: Float[Array, "s 4 4"]) -> tuple[Float[Array, "s 4 4"], Bool[Array, " s"]]:
+        """Updated poses, and whose update was small."""
+        update = self.predict(views, T)
         # float32 products drift from orthonormal over many iterations, so each update is made a rotation again.
         dR, dt_m = se3.nearest_rotation(update.dR.double().cpu().numpy()), update.dt.double().cpu().numpy()
-        batch.T[moved] = se3.apply_update(batch.T[moved], dR, dt_m)
-        batch.iterations[moved] += 1
         small = np.rad2deg(se3.rotation_angle_rad(dR)) < STOP_ANGLE_DEG
-        batch.converged[moved] = small & (np.linalg.norm(dt_m, axis=-1) < STOP_DISTANCE_M)
+        return se3.apply_update(T, dR, dt_m), small & (np.linalg.norm(dt_m, axis=-1) < STOP_DISTANCE_M)
 
     def _judge(
         self, frame: Frame, T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"], scorer: Scorer | None
@@ -214,7 +220,7 @@ class Refiner:
         confidence, failures = np.zeros(len(T)), []
         for first in range(0, len(T), self._batch):
             part = slice(first, first + self._batch)
-            views = self._viewer.look(frame, T[part], obj_id[part])
+            views = self.viewer.look(frame, T[part], obj_id[part])
             failures += views.failures
             if len(views.rows):
                 confidence[part][views.rows] = self._confidence(views, T[part][views.rows], scorer)
@@ -222,7 +228,7 @@ class Refiner:
 
     def _confidence(self, views: Views, T: Float[Array, "s 4 4"], scorer: Scorer | None) -> Float[Array, " s"]:
         if (scorer or self.scorer) == "learned":
-            logit = self._predict(views, T).confidence
+            logit = self.predict(views, T).confidence
             if logit is None:
                 raise CheckpointError(
                     f"{self.checkpoint.path}: its network has no confidence output; choose --scorer gradient"
@@ -230,7 +236,7 @@ class Refiner:
             return np.asarray(torch.sigmoid(logit.double()).cpu().numpy())
         return gradient_agreement(views.scene_rgb, views.hypothesis_rgb, views.mask, views.inside)
 
-    def _predict(self, views: Views, T: Float[Array, "s 4 4"]) -> PoseUpdate:
+    def predict(self, views: Views, T: Float[Array, "s 4 4"]) -> PoseUpdate:
         """The network's update of these views, in as many passes as memory asks for."""
         wanted = self._batch
         while True:
@@ -268,7 +274,7 @@ class Refiner:
         return update
 
     def _tensor(self, values: Array) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self._device)
+        return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
 
 def _poses(requests: Sequence[Request]) -> Float[Array, "b 4 4"]:

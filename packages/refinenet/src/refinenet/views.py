@@ -64,6 +64,11 @@ class Viewer:
         """Free what the renderer holds."""
         self._rasteriser.close()
 
+    @property
+    def renderer(self) -> str:
+        """What draws, in its own words."""
+        return self._rasteriser.device
+
     def look(self, frame: Frame, T_cam_obj: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]) -> Views:
         """Views of poses in a frame; a pose without a pixel of the object inside the image has none."""
         p, b = self._patch_px, len(T_cam_obj)
