@@ -26,6 +26,8 @@ NAMES = [
     "loss_ablation",
     "category_level",
     "tracking",
+    "symmetric_loss",
+    "ablation_plus",
     "speed",
 ]
 SIZES = ["smoke", "small", "full"]
@@ -142,7 +144,7 @@ def test_help_and_list_run_nothing(name, inputs, tmp_path) -> None:
     script = [sys.executable, str(ROOT / "experiments" / f"{name}.py")]
     shown = subprocess.run([*script, "--help"], capture_output=True, text=True, timeout=60)
     assert shown.returncode == 0, shown.stderr
-    assert "Protocol" in shown.stdout and all(f"--{size}" in shown.stdout for size in SIZES)
+    assert experiment(name).doc.splitlines()[0] in shown.stdout and all(f"--{size}" in shown.stdout for size in SIZES)
     work = tmp_path / "work"
     listed = subprocess.run(
         [*script, str(work), "--smoke", "--list", "--data", str(inputs.data)],
