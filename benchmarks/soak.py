@@ -47,7 +47,6 @@ class Soak:
         self.arguments = arguments
         self.out: Path = arguments.out
         self.rng = np.random.default_rng(arguments.seed)
-        self.ends_s = time.monotonic() + 60 * arguments.minutes
         self.start_s = 1.0
         self.counts = {"worker_kills": 0, "driver_kills": 0, "rounds": 0}
         self.skipped: list[str] = []
@@ -111,7 +110,8 @@ class Soak:
         A kill waits for up to twice the time that the command takes to its first shard: half of them hit the start.
         """
         folder, process, done = self.out / "killed", None, 0
-        while done < self.arguments.kills and time.monotonic() < self.ends_s:
+        ends_s = time.monotonic() + 60 * self.arguments.minutes
+        while done < self.arguments.kills and time.monotonic() < ends_s:
             process = process or self.start(folder)
             time.sleep(self.rng.uniform(0.0, 2 * self.start_s))
             workers = self.workers_of(process)
@@ -139,8 +139,10 @@ class Soak:
         if process is not None:
             _, said = process.communicate()
             self.judge(process.returncode, said, 0, "complete")
-        else:
+        elif folder.exists():
             self.finish(self.command(folder), says="complete")
+        else:  # the last round ended by itself and was compared
+            return
         self.compare(folder, f"after {done} kills")
         self.counts["rounds"] += 1
 
