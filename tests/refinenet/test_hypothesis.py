@@ -150,7 +150,8 @@ def test_overlap_is_one_at_the_truth_whatever_covers_it_and_zero_apart():
     truth = bits > 0
     apart = np.roll(truth, 4, axis=1) & ~truth
     assert visible_overlap(truth, bits) == 1
-    assert visible_overlap(np.roll(truth, 2, axis=0), bits) == pytest.approx(8 / 24)
+    for background in (np.uint8(0), np.uint8(4)):  # a wall is foreground too, and hides nothing
+        assert visible_overlap(np.roll(truth, 2, axis=0), bits | background) == pytest.approx(8 / 24)
     bits[2:6, 2:4] = 1 | 4
     assert visible_share(bits) == 0.5
     assert visible_overlap(truth, bits) == 1
