@@ -17,7 +17,7 @@ SMALL = [
 
 def test_every_command_shows_an_example(cli):
     assert cli("--help").exit_code == 0
-    for command in ("train", "refine"):
+    for command in ("train", "refine", "track", "export"):
         assert f"refinenet {command} " in cli(command, "--help").output
 
 

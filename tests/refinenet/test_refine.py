@@ -429,3 +429,14 @@ def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
         assert text in result.stderr
         assert "Traceback" not in result.output
         assert len([line for line in result.stderr.splitlines() if line.startswith("Error: ")]) == 1
+
+
+def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tmp_path):
+    """The digest that training stores fits the mesh that a BOP dataset or a file brings, and no other."""
+    small = ["--steps", 1, "--batch", 4, "--workers", 0, "--threads", 1, "--set", "loss.contour_points=32"]
+    result = cli("train", dataset, "--out", tmp_path / "run", *small, "--set", "validation.pairs=4", "--quiet")
+    assert result.exit_code == 0, result.output
+    Refiner.load(tmp_path / "run" / "best.safetensors", {1: mesh}).close()
+    painted = replace(mesh, vertex_rgb=255 - mesh.vertex_rgb, sha256="f" * 64)
+    with pytest.raises(CheckpointError, match="object 1 is another mesh than in training"):
+        Refiner.load(tmp_path / "run" / "best.safetensors", {1: painted})
