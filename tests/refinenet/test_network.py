@@ -254,6 +254,14 @@ def test_training_options_are_checked():
         load_config("paper", ["network.patch_px=64"])
     with pytest.raises(ConfigError, match="unknown preset 'minus'"):
         load_config("minus")
+    with pytest.raises(
+        ConfigError, match=r"augment.occlusion needs pairs made in the training loop: window.kind=diameter"
+    ):
+        load_config("paper", ["augment.occlusion=0.5"])
+    with pytest.raises(ConfigError, match=r"begin is 0.7, expected 0 to full, which is 0.5"):
+        load_config("compact", ["own_predictions.begin=0.7"])
+    with pytest.raises(ConfigError, match=r"patch_px is 72, expected a multiple of 32 for kind=plus"):
+        load_config("plus", ["network.patch_px=72"])
     config = load_config("paper", ["backbone.name=inception_v3", "backbone.pretrained=false", "steps=5"])
     assert (config.network.backbone.name, config.network.backbone.pretrained) == ("inception_v3", False)
     assert replace(config, steps=100_000).optimiser.lr == 3e-4

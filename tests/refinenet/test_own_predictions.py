@@ -166,11 +166,13 @@ def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path)
     [
         "network.rotation=quaternion", "network.translation=camera", "network.kind=plus", "network.confidence=true",
         "window.kind=fixed", "hypothesis.fresh=false", "augment.occlusion=1.0", "own_predictions.share=1.0",
-        "loss.name=mse",
+        "loss.name=mse", "stored pairs",
     ],
 )  # fmt: skip
 def test_every_switch_trains_alone(dataset, tmp_path, switch):
-    trainer = Trainer(small("own_predictions.begin=0", "own_predictions.full=0", switch), str(dataset), tmp_path)
+    stored = ["window.kind=fixed", "hypothesis.fresh=false", "network.confidence=true", "own_predictions.share=1"]
+    switches = stored if switch == "stored pairs" else [switch]
+    trainer = Trainer(small("own_predictions.begin=0", "own_predictions.full=0", *switches), str(dataset), tmp_path)
     try:
         values = trainer.take_step(next(trainer.stream()))
     finally:
