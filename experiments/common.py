@@ -125,8 +125,7 @@ class Comparison:
         networks: By the name in the report.
         baselines: Methods without a network.
         starts: Options of `evalkit perturb`.
-        iterations: Most updates of a pose by a network.
-        settle: Most updates by a baseline, which is to converge.
+        iterations: Of `refinenet refine`, the same for all methods.
         dataset: Real test images, instead of rendered ones.
         init: Start poses for them, instead of perturbed ones.
         workers: Processes that render test images.
@@ -144,7 +143,6 @@ class Comparison:
     baselines: tuple[str, ...] = tuple(BASELINES)
     starts: str = ""
     iterations: int = 5
-    settle: int = 30
     dataset: Path | None = None
     init: Path | None = None
     workers: int = 2
@@ -165,14 +163,13 @@ def compared(work: Path, what: Comparison) -> list[Step]:
         )
     if what.init is None:
         steps.append(start_poses(work, what.starts))
-    refine = f"refinenet refine --dataset {dataset} --init {init}"
+    refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations}"
     results = []
     for name, network in what.networks.items():
-        steps += refinements(work, what, f"{refine} --iterations {what.iterations} {what.refine}", name, network)
+        steps += refinements(work, what, f"{refine} {what.refine}", name, network)
         results.append(name)
     for name in what.baselines:
-        chosen = f"{refine} --iterations {what.settle} --method {name}"
-        steps.append(refinement(work, chosen, name, f"The same starts, refined by {name}."))
+        steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))
         results.append(name)
     named = " ".join(f"--results {path}" for path in [init, *(f"{folder}/results/{name}.csv" for name in results)])
     steps.append(

@@ -41,7 +41,6 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             networks=networks,
             starts="--random-up-to 20 --random-translation 0.2",
             iterations=1,
-            settle=1,
         ),
     )
 
