@@ -440,3 +440,10 @@ def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tm
     painted = replace(mesh, vertex_rgb=255 - mesh.vertex_rgb, sha256="f" * 64)
     with pytest.raises(CheckpointError, match="object 1 is another mesh than in training"):
         Refiner.load(tmp_path / "run" / "best.safetensors", {1: painted})
+
+
+def test_a_method_and_its_checkpoint_belong_together(cli, bop, tmp_path):
+    root, start = bop
+    result = cli("refine", "--dataset", root, "--init", start, "--out", tmp_path / "x.csv")
+    assert result.exit_code == 2
+    assert "--method network needs a --checkpoint" in result.stderr

@@ -111,6 +111,7 @@ def test_a_folder_and_a_video_give_the_scenes_poses(cli, scene, still, mesh, tmp
         writer.write(cv2.imread(str(file)))
     writer.release()
     save_ply(mesh, tmp_path / "part.ply", units="mm")
+    (tmp_path / "models_info.json").write_text('{"part": {"diameter": 100.0}, "other": {"diameter": -1}}')
     rest = ["--camera", root / "cam.json", "--mesh", tmp_path / "part.ply", "--pose", root / "pose.json"]
     for source in (folder, tmp_path / "clip.avi"):
         out = tmp_path / f"{source.name}.csv"

@@ -210,7 +210,8 @@ def _models(
     sequence: "FrameSequence", files: tuple[Path, ...], loaded: "Checkpoint", obj_ids: list[int]
 ) -> "tuple[dict[int, Mesh], dict[int, ModelInfo]]":
     """Meshes and symmetries of the objects: the dataset's, or files with a models_info.json beside them."""
-    from posecore.bop import load_models_info
+    from posecore.bop.jsonfile import read_json
+    from posecore.bop.models_info import load_model_info
     from posecore.mesh import load_mesh
 
     from refinenet.sequence import BopScene
@@ -231,8 +232,10 @@ def _models(
         obj_id = int(numbered[1]) if numbered else trained[0]
         meshes[obj_id] = load_mesh(file, units="mm")
         info_file = file.with_name("models_info.json")
-        if info_file.is_file():
-            symmetric |= {i: info for i, info in load_models_info(info_file).items() if i == obj_id}
+        listed = read_json(info_file) if info_file.is_file() else {}
+        entry = listed.get(str(obj_id)) or listed.get(file.stem)  # by number as in BOP, or by the mesh's name
+        if entry is not None:
+            symmetric[obj_id] = load_model_info(entry, f"{info_file}, object {obj_id}")
     missing = [i for i in obj_ids if i not in meshes]
     if missing:
         raise ConfigError(f"object {missing[0]} has a start pose and no mesh; give its file with --mesh")
