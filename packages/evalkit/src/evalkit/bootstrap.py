@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 from posecore.errors import ConfigError
-from scipy import stats
+from scipy import special
 
 from evalkit.scores.values import Values, score_values
 
@@ -182,8 +182,8 @@ def outer_percentiles(units: int, confidence: float = CONFIDENCE) -> tuple[float
     With 30 units they are 0.017 and 0.983 instead of 0.025 and 0.975.
     """
     tail = (1.0 - confidence) / 2.0
-    stretched = np.sqrt(units / (units - 1.0)) * stats.t.ppf(tail, units - 1)
-    low = float(stats.norm.cdf(stretched))
+    stretched = np.sqrt(units / (units - 1.0)) * special.stdtrit(units - 1, tail)
+    low = float(special.ndtr(stretched))
     return low, 1.0 - low
 
 

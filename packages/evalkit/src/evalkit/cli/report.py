@@ -2,17 +2,13 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
-from posecore.bop import BopDataset
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from evalkit.cli.options import FOLDER, split_option
-from evalkit.evaluate import VssKind
-from evalkit.files import dataset_of, find_result_files
-from evalkit.report import write_report
 
 
 @click.command()
@@ -31,7 +27,12 @@ from evalkit.report import write_report
 )
 @click.option("--worst", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of worst cases.")
 def report(
-    dataset: Path | None, results: tuple[Path, ...], out: Path, split: str | None, vss: VssKind, worst: int
+    dataset: Path | None,
+    results: tuple[Path, ...],
+    out: Path,
+    split: str | None,
+    vss: Literal["full", "visible"],
+    worst: int,
 ) -> None:
     """Write a report: one HTML page, its tables for papers, a CSV line for each pose, a JSON summary.
 
@@ -44,6 +45,11 @@ def report(
       evalkit report
       evalkit report --dataset lmo --results start.csv --results refined.csv --out report
     """
+    from posecore.bop import BopDataset
+
+    from evalkit.files import dataset_of, find_result_files
+    from evalkit.report import write_report
+
     here = Path()
     paths = list(results) or find_result_files(here)
     opened = BopDataset(dataset or dataset_of(paths, here), split)
