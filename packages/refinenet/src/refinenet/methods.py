@@ -16,7 +16,11 @@ from posecore.mesh import Mesh
 Array = np.ndarray
 
 NETWORK = "network"
-BASELINES: dict[str, str] = {}
+BASELINES: dict[str, str] = {
+    "edge-icp": "refinenet.baselines.edge_icp:EdgeIcp",
+    "depth-icp": "refinenet.baselines.depth_icp:DepthIcp",
+    "region": "refinenet.baselines.region:RegionTracker",
+}
 """By name of the method, `module:class` of a `PoseRefiner` that is made with `(meshes, iterations=...)`."""
 
 

@@ -1,0 +1,1 @@
+"""Refiners without a network, for comparison: edges, depth, colour regions."""

@@ -1,0 +1,66 @@
+"""The refiner's interface around a function that refines one pose."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from posecore import se3
+from posecore.mesh import Mesh
+from posecore.raster import Rasteriser
+
+from refinenet.baselines.view import Target
+from refinenet.methods import Frame, Refinement, Request, Status
+
+Array = np.ndarray
+SMALL_ANGLE_RAD = np.deg2rad(0.5)
+SMALL_DISTANCE = 0.01
+"""Under this angle and this share of the diameter, an update is small."""
+
+
+class Baseline(ABC):
+    """A `PoseRefiner` that goes through the poses one by one.
+
+    Args:
+        meshes: Objects by id.
+        iterations: Renders, each followed by an update, at every resolution or search range.
+    """
+
+    name: ClassVar[str]
+    needs_depth: ClassVar[bool] = False
+
+    def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:
+        self.iterations = iterations
+        self._meshes = dict(meshes)
+        self._rasteriser = Rasteriser(meshes)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """For the sidecar."""
+        return {"iterations": self.iterations}
+
+    def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+        """Refine poses in one image."""
+        targets = [Target(obj_id=r.obj_id, mesh=self._meshes[r.obj_id], rasteriser=self._rasteriser) for r in requests]
+        return [self._refine(frame, r.T_cam_obj, target) for r, target in zip(requests, targets, strict=True)]
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        self._rasteriser.close()
+
+    @abstractmethod
+    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement: ...
+
+
+def failed(start: Float[Array, "4 4"], iterations: int, why: str) -> Refinement:
+    """The start pose and the reason."""
+    T = np.asarray(start, np.float64)
+    return Refinement(T_cam_obj=T, status=Status.FAILED, iterations=iterations, failure=why)
+
+
+def refined(before: Float[Array, "4 4"], after: Float[Array, "4 4"], iterations: int, diameter_m: float) -> Refinement:
+    """The pose `after`, converged if the last update, which led there from `before`, was small."""
+    dR, dt_m = se3.update_between(before, after)
+    small = se3.rotation_angle_rad(dR) < SMALL_ANGLE_RAD and np.linalg.norm(dt_m) < SMALL_DISTANCE * diameter_m
+    return Refinement(T_cam_obj=after, status=Status.CONVERGED if small else Status.STOPPED, iterations=iterations)
