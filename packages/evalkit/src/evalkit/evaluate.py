@@ -1,15 +1,16 @@
 """Dataset and result files to a table: one row for every expected pose, found or missing."""
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
-from posecore.bop import BopDataset, GroundTruth, symmetry_transforms
+from posecore.bop import BopDataset, Estimate, GroundTruth, symmetry_transforms
 from posecore.camera import Camera
 from posecore.errors import DatasetError
 from posecore.mesh import Mesh
@@ -18,7 +19,10 @@ from posecore.symmetry import align_ball, is_ball
 from scipy.spatial import ConvexHull, QhullError
 
 from evalkit import metrics, silhouette
-from evalkit.pairing import Level, Pair
+from evalkit.files import load_result_files
+from evalkit.pairing import Level, Pair, pair_up
+from evalkit.scores.bop import AllErrors, with_bop19
+from evalkit.scores.definitions import VSD_COLUMNS, VSD_TAUS
 from evalkit.silhouette import Patch, View
 from evalkit.table import table_of
 
@@ -31,6 +35,37 @@ ERRORS = (
 )
 """Columns that are NaN where an estimate is missing."""
 
+TRUTH_COLUMNS = (
+    *("scene_id", "im_id", "obj_id", "gt_index", "visib_fract"),
+    *("inst_count", "diameter_m", "image_width_px"),
+)
+
+
+def evaluate(dataset: str | Path, results: str | Path, *, vss: VssKind = "full", with_vsd: bool = True) -> pd.DataFrame:
+    """Errors of the poses in a result file: one row for each expected pose, found or missing.
+
+    `evalkit.scores.scores(table)` sums them up; `evalkit.table.COLUMNS` says what each column holds, with its unit.
+    Beside those columns stand `vsd_0.05` ... `vsd_0.50` where images have depth (VSD at these tolerances in diameters,
+    NaN for images without), and `bop19_mssd`, `bop19_mspd` and, where all images have depth, `bop19_vsd`: the share of
+    BOP19's thresholds at which BOP's matching gives the instance an estimate. Files of perturbed starts have none.
+
+    Args:
+        dataset: folder in BOP format with ground truth.
+        results: BOP result file (CSV), translations in millimetres.
+        vss: whole silhouettes, or their visible parts, which needs depth images.
+        with_vsd: whether VSD is computed where there is depth.
+
+    Raises:
+        PoseError: a file or the dataset is not usable; the message names it.
+    """
+    opened = BopDataset(dataset)
+    (file,) = load_result_files([Path(results)], opened)
+    with Evaluator(opened, vss, with_vsd=with_vsd) as evaluator:
+        table = evaluator.evaluate(pair_up(opened, file).pairs)
+        if "perturbation" in file.sidecar:
+            return table
+        return with_bop19(table, evaluator.all_errors(file.estimates))
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Model:
@@ -42,14 +77,16 @@ class _Model:
 class Evaluator:
     """Scores pairs against one dataset; true silhouettes are rendered once for all result files."""
 
-    def __init__(self, dataset: BopDataset, vss: VssKind = "full") -> None:
+    def __init__(self, dataset: BopDataset, vss: VssKind = "full", *, with_vsd: bool = True) -> None:
         """Open a renderer for the dataset's models (`models_eval` where there is one).
 
         Args:
             dataset: with ground truth.
             vss: whole silhouettes, or their visible parts, which needs depth images.
+            with_vsd: whether VSD is added where an image has depth, in columns `vsd_0.05` ... `vsd_0.50`.
         """
-        self.dataset, self.vss = dataset, vss
+        self.dataset, self.vss, self.with_vsd = dataset, vss, with_vsd
+        self._depth: tuple[tuple[int, int], Float[Array, "h w"] | None] | None = None
         self.rasteriser = Rasteriser({})
         self._models: dict[int, _Model] = {}
         self._true_patches: dict[tuple[int, int, int], Patch] = {}
@@ -69,12 +106,68 @@ class Evaluator:
         Raises:
             DatasetError: a model is missing, or VSS of visible parts is wanted and an image has no depth.
         """
-        values = self._vss(pairs)
+        values, vsd = self._silhouette_errors(pairs)
         rows = []
         for pair, value in zip(pairs, values, strict=True):
             rows.append(self._row(pair, value))
             advance(1)
-        return table_of(rows)
+        table = table_of(rows)
+        if self.with_vsd and np.isfinite(vsd).any():
+            table[list(VSD_COLUMNS)] = vsd
+        return table
+
+    def all_errors(self, estimates: Sequence[Estimate]) -> AllErrors:
+        """Every estimate in the targets' images against every true instance of its object: what BOP19 and BOP24 match.
+
+        Args:
+            estimates: of a result file; those in other images are left out.
+        """
+        asked = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in self.dataset.targets}
+        images = list(dict.fromkeys(key[:2] for key in asked))
+        truths = [
+            (*image, gt) for image in images for gt in self.dataset.gt(*image) if gt.has_pose and gt.obj_id in self._ids
+        ]
+        kept = [estimate for estimate in estimates if (estimate.scene_id, estimate.im_id) in set(images)]
+        places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
+        for place, (scene_id, im_id, gt) in enumerate(truths):
+            places[scene_id, im_id, gt.obj_id].append(place)
+        pairs, ends = [], []
+        for index, estimate in enumerate(kept):
+            for place in places.get((estimate.scene_id, estimate.im_id, estimate.obj_id), []):
+                scene_id, im_id, gt = truths[place]
+                pairs.append(Pair(scene_id=scene_id, im_id=im_id, truth=gt, estimate=estimate))
+                ends.append((index, place))
+        errors = self.evaluate(pairs)
+        columns = ["mssd_m", "mspd_px", *(name for name in VSD_COLUMNS if name in errors)]
+        errors = errors[columns].copy()
+        if not errors.reindex(columns=list(VSD_COLUMNS)).notna().all(axis=None):
+            errors = errors[["mssd_m", "mspd_px"]]  # images without depth: no recall of VSD
+        errors.insert(0, "estimate", np.array([end[0] for end in ends], np.int64))
+        errors.insert(1, "truth", np.array([end[1] for end in ends], np.int64))
+        return AllErrors(
+            estimates=pd.DataFrame(
+                [(e.scene_id, e.im_id, e.obj_id, e.line, e.score) for e in kept],
+                columns=["scene_id", "im_id", "obj_id", "line", "score"],
+            ),
+            truths=pd.DataFrame(
+                [self._truth_row(scene_id, im_id, gt, asked) for scene_id, im_id, gt in truths],
+                columns=list(TRUTH_COLUMNS),
+            ),
+            errors=errors,
+        )
+
+    def _truth_row(
+        self, scene_id: int, im_id: int, gt: GroundTruth, asked: Mapping[tuple[int, int, int], int]
+    ) -> tuple[Any, ...]:
+        visible = np.nan if gt.visib_fract is None else gt.visib_fract
+        count = asked.get((scene_id, im_id, gt.obj_id), 0)
+        diameter_m = self.dataset.models_info[gt.obj_id].diameter_m
+        width_px = self.camera(scene_id, im_id).width_px
+        return scene_id, im_id, gt.obj_id, gt.gt_index, visible, count, diameter_m, width_px
+
+    @property
+    def _ids(self) -> set[int]:
+        return set(self.dataset.models_info)
 
     def camera(self, scene_id: int, im_id: int) -> Camera:
         """Intrinsics of an image, read once."""
@@ -99,15 +192,20 @@ class Evaluator:
             )
         return self._models[obj_id]
 
-    def _vss(self, pairs: Sequence[Pair]) -> list[float]:
+    def _silhouette_errors(self, pairs: Sequence[Pair]) -> tuple[list[float], Float[Array, "n t"]]:
+        """VSS of each pair, 0 where missing, and VSD for every tolerance, NaN where missing or without depth."""
         self._render_truths(pairs)
-        values = [0.0] * len(pairs)
+        values, vsd = [0.0] * len(pairs), np.full((len(pairs), len(VSD_TAUS)), np.nan)
+        patches_of: dict[int, Patch] = {}
         for obj_id, indices in _by_object(pairs, lambda pair: pair.estimate is not None):
             views = [self._view(pairs[index], estimated=True) for index in indices]
             patches = silhouette.render_patches(self.rasteriser, obj_id, self.mesh(obj_id), views)
-            for index, patch in zip(indices, patches, strict=True):
-                values[index] = self._compare(pairs[index], patch)
-        return values
+            patches_of |= zip(indices, patches, strict=True)
+        for index, patch in sorted(
+            patches_of.items(), key=lambda item: (pairs[item[0]].scene_id, pairs[item[0]].im_id)
+        ):
+            values[index], vsd[index] = self._compare(pairs[index], patch)
+        return values, vsd
 
     def _render_truths(self, pairs: Sequence[Pair]) -> None:
         fresh = {_truth_key(pair): pair for pair in pairs if _truth_key(pair) not in self._true_patches}
@@ -123,17 +221,29 @@ class Evaluator:
         pose = pair.estimate.T_cam_obj if estimated and pair.estimate is not None else pair.truth.T_cam_obj
         return View(camera=self.camera(pair.scene_id, pair.im_id), T_cam_obj=pose)
 
-    def _compare(self, pair: Pair, patch: Patch) -> float:
-        true = self._true_patches[_truth_key(pair)]
-        if self.vss == "full":
-            return silhouette.vss_full(patch, true)
-        depth_m = self.dataset.depth_m(pair.scene_id, pair.im_id)
+    def _compare(self, pair: Pair, patch: Patch) -> tuple[float, Float[Array, " t"]]:
+        true, K = self._true_patches[_truth_key(pair)], self.camera(pair.scene_id, pair.im_id).K
+        vss = silhouette.vss_full(patch, true) if self.vss == "full" else np.nan
+        depth_m = self._depth_m(pair.scene_id, pair.im_id) if self.vss == "visible" or self.with_vsd else None
         if depth_m is None:
+            if self.vss == "full":
+                return vss, np.full(len(VSD_TAUS), np.nan)
             scene = self.dataset.scene_path(pair.scene_id)
             raise DatasetError(
                 f"{scene / 'depth'}: image {pair.im_id} has no depth, which --vss visible needs; use --vss full"
             )
-        return silhouette.vss_visible(patch, true, self.camera(pair.scene_id, pair.im_id).K, depth_m)
+        if self.vss == "visible":
+            vss = silhouette.vss_visible(patch, true, K, depth_m)
+        if not self.with_vsd:
+            return vss, np.full(len(VSD_TAUS), np.nan)
+        taus_m = VSD_TAUS * self.dataset.models_info[pair.truth.obj_id].diameter_m
+        return vss, silhouette.vsd(patch, true, K, depth_m, taus_m)
+
+    def _depth_m(self, scene_id: int, im_id: int) -> Float[Array, "h w"] | None:
+        """Depth of an image; the last one is kept, as pairs come image by image."""
+        if self._depth is None or self._depth[0] != (scene_id, im_id):
+            self._depth = (scene_id, im_id), self.dataset.depth_m(scene_id, im_id)
+        return self._depth[1]
 
     def _row(self, pair: Pair, vss: float) -> dict[str, Any]:
         truth, estimate = pair.truth, pair.estimate

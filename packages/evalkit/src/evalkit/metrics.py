@@ -13,6 +13,8 @@ from scipy.spatial import cKDTree
 
 Array = np.ndarray
 Pose = Float[Array, "4 4"]
+BOP_RAY_PX = 0.0
+"""Where in a pixel bop_toolkit's rays go through when it turns depth into distance."""
 CHUNK_VALUES = 3_000_000
 """Largest number of floats held at once when a model is moved by every symmetry."""
 
@@ -146,11 +148,11 @@ def vss(mask_est: Bool[Array, "h w"], mask_gt: Bool[Array, "h w"]) -> float:
 
 
 def visible_masks(
-    distance_est_m: Float[Array, "h w"],
-    distance_gt_m: Float[Array, "h w"],
-    distance_scene_m: Float[Array, "h w"],
+    distance_est_m: Float[Array, "*b h w"],
+    distance_gt_m: Float[Array, "*b h w"],
+    distance_scene_m: Float[Array, "*b h w"],
     delta_m: float = 0.015,
-) -> tuple[Bool[Array, "h w"], Bool[Array, "h w"]]:
+) -> tuple[Bool[Array, "*b h w"], Bool[Array, "*b h w"]]:
     """Visible parts of an estimated and a true render before a measured scene (BOP19's rules).
 
     A rendered pixel is visible where nothing was measured, or what was measured is not nearer by more than `delta_m`.
@@ -168,14 +170,43 @@ def visible_masks(
     return visible_est, visible_gt
 
 
+def vsd(
+    distance_est_m: Float[Array, "*b h w"],
+    distance_gt_m: Float[Array, "*b h w"],
+    distance_scene_m: Float[Array, "*b h w"],
+    taus_m: Float[Array, " t"],
+    delta_m: float = 0.015,
+) -> Float[Array, "*b t"]:
+    """Visible surface discrepancy (VSD), 0 to 1, for every tolerance; 1 where neither pose is visible.
+
+    Of the pixels where either render is visible, the share where only one is, or where both are and their distances
+    differ by a tolerance or more ("step" cost). Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV
+    2018, with the visibility of BOP19 (`visible_masks`).
+
+    Args:
+        distance_est_m: distance from the camera's centre (not z), 0 where not hit.
+        distance_gt_m: the same for the true pose.
+        distance_scene_m: the same as measured, 0 where unknown.
+        taus_m: tolerances, metres; BOP19 takes 0.05, 0.10, ... 0.50 diameters.
+        delta_m: tolerance of visibility, metres.
+    """
+    visible_est, visible_gt = visible_masks(distance_est_m, distance_gt_m, distance_scene_m, delta_m)
+    both = visible_est & visible_gt
+    apart = np.abs(distance_gt_m - distance_est_m)
+    union = np.count_nonzero(visible_est | visible_gt, axis=(-2, -1))
+    agree = np.stack([np.count_nonzero(both & (apart < tau), axis=(-2, -1)) for tau in taus_m], axis=-1)
+    return np.where(union[..., None] > 0, 1.0 - agree / np.maximum(union, 1)[..., None], 1.0)
+
+
 def distance_from_depth(
-    K: Float[Array, "3 3"], depth_m: Float[Array, "h w"], x0_px: int = 0, y0_px: int = 0
+    K: Float[Array, "3 3"], depth_m: Float[Array, "h w"], x0_px: int = 0, y0_px: int = 0, ray_px: float = 0.5
 ) -> Float[Array, "h w"]:
     """Distance from the camera's centre for a depth image that starts at pixel (x0, y0), metres.
 
-    Rays go through pixel centres (+0.5). bop_toolkit sends them through the pixels' corners, half a pixel off.
+    Rays go through pixel centres (+0.5), where renderers sample. bop_toolkit sends them through the pixels' corners,
+    half a pixel off: `ray_px=0` (`BOP_RAY_PX`), which VSD takes so that its numbers are BOP's.
     """
     rows, columns = depth_m.shape
-    x = (np.arange(columns) + x0_px + 0.5 - K[0, 2]) / K[0, 0]
-    y = (np.arange(rows) + y0_px + 0.5 - K[1, 2]) / K[1, 1]
+    x = (np.arange(columns) + x0_px + ray_px - K[0, 2]) / K[0, 0]
+    y = (np.arange(rows) + y0_px + ray_px - K[1, 2]) / K[1, 1]
     return np.asarray(depth_m * np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2))

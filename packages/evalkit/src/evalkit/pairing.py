@@ -70,7 +70,7 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
     by_key = _by_key(result.estimates)
     pairs: list[Pair] = []
     for target in dataset.targets:
-        truths = truths_of(dataset, target)
+        truths = truths_of(dataset, target)[: target.inst_count]  # BOP means the most visible ones
         candidates = by_key.get((target.scene_id, target.im_id, target.obj_id), [])
         best = sorted(candidates, key=lambda estimate: -estimate.score)[: target.inst_count]
         matched: list[tuple[GroundTruth, Estimate | None]] = []

@@ -100,11 +100,31 @@ def vss_visible(
     estimated: Patch, true: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"], delta_m: float = 0.015
 ) -> float:
     """VSS of the visible parts, by measured depth: 1 - VSD with tau = infinity."""
+    distances = _distances(estimated, true, K, depth_scene_m)
+    return metrics.vss(*metrics.visible_masks(distances[0], distances[1], distances[2], delta_m))
+
+
+def vsd(
+    estimated: Patch,
+    true: Patch,
+    K: Float[Array, "3 3"],
+    depth_scene_m: Float[Array, "h w"],
+    taus_m: Float[Array, " t"],
+    delta_m: float = 0.015,
+) -> Float[Array, " t"]:
+    """VSD for every tolerance from one pair of renders, see `metrics.vsd`."""
+    distances = _distances(estimated, true, K, depth_scene_m)
+    return metrics.vsd(distances[0], distances[1], distances[2], taus_m, delta_m)
+
+
+def _distances(
+    estimated: Patch, true: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"]
+) -> list[Float[Array, "rows columns"]]:
+    """Distances of the estimate, the truth and the scene where either was rendered, along bop_toolkit's rays."""
     first, second, x0, y0 = _on_common_canvas(estimated, true)
     rows, columns = first.shape
     scene = depth_scene_m[y0 : y0 + rows, x0 : x0 + columns]
-    distances = [metrics.distance_from_depth(K, depth_m, x0, y0) for depth_m in (first, second, scene)]
-    return metrics.vss(*metrics.visible_masks(distances[0], distances[1], distances[2], delta_m))
+    return [metrics.distance_from_depth(K, part, x0, y0, metrics.BOP_RAY_PX) for part in (first, second, scene)]
 
 
 def _on_common_canvas(first: Patch, second: Patch) -> tuple[Float[Array, "h w"], Float[Array, "h w"], int, int]:
