@@ -30,6 +30,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
     "pillow",  # trimesh reads textures with it
     "tensorboard",  # torch.utils.tensorboard writes with it
     "s3fs",  # fsspec opens s3:// with it
+    "onnx",
+    "onnxscript",  # torch.onnx.export translates with them
     "zarr",  # what others open a dataset with; tests hold our shard files against it
 }
 TEST_TIME_ORACLES = {"timm"}
