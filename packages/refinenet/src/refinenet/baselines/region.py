@@ -52,8 +52,8 @@ class RegionTracker(Baseline):
 class Colours:
     """How often each colour occurs: (BINS, BINS, BINS) shares that sum to 1, on the object and beside it."""
 
-    object: Float[Array, "n n n"]
-    background: Float[Array, "n n n"]
+    object: Float[Array, "bins bins bins"]
+    background: Float[Array, "bins bins bins"]
 
     def posterior(self, rgb: UInt8[Array, "h w 3"]) -> Float[Array, "h w"]:
         """How likely a pixel is the object's, if both were as likely before."""
@@ -77,7 +77,7 @@ def colours_of(view: View) -> Colours | None:
     return Colours(object=_histogram(view.scene_rgb[inside]), background=_histogram(view.scene_rgb[outside]))
 
 
-def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "n n n"]:
+def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
     index = rgb.astype(np.int64) * BINS // 256
     counts = np.bincount(index @ np.array([BINS * BINS, BINS, 1]), minlength=BINS**3).reshape(BINS, BINS, BINS)
     smooth = gaussian_filter(counts.astype(np.float64), 0.7)
