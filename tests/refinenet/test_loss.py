@@ -230,3 +230,10 @@ def test_point_loss_is_disentangled(mesh, turned):
     right = torch.zeros_like(quat).copy_(quat.detach()).requires_grad_()
     loss.point_loss_px(PoseUpdate(geometry.rotation_from_quat_wxyz(right), true.dt), turned, objects).sum().backward()
     torch.testing.assert_close(quat.grad, right.grad)
+
+
+def test_points_that_are_no_numbers_give_a_loss_that_is_none_and_no_crash():
+    uv = torch.full((2, 5, 2), float("nan"), requires_grad=True)
+    values = loss.sample_distance(torch.rand(2, 16, 16), uv)
+    assert torch.isnan(values).all()
+    values.sum().backward()

@@ -68,7 +68,8 @@ def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b
     plain border padding would leave it no gradient, and a point lost outside would never come back.
     """
     patch_px = distance_px.shape[-1]
-    inside = torch.clamp(uv_px, 0.5, patch_px - 0.5)
+    # grid_sample's backward pass on a CPU reads outside of the patch at NaN; the overshoot below stays NaN.
+    inside = torch.clamp(torch.nan_to_num(uv_px), 0.5, patch_px - 0.5)
     grid = inside * (2.0 / patch_px) - 1.0
     value = torch.nn.functional.grid_sample(
         distance_px[:, None], grid[:, None], mode="bilinear", padding_mode="border", align_corners=False
