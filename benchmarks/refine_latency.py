@@ -11,6 +11,7 @@ import json
 import os
 import statistics
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -98,6 +99,7 @@ def report(arguments: argparse.Namespace, refiner: Refiner, times_ms: dict[int, 
     """Print a line for each batch size and the JSON line."""
     result: dict[str, object] = {
         "benchmark": "refine_latency",
+        "date": datetime.now(UTC).date().isoformat(),
         "checkpoint": arguments.checkpoint.name,
         "preset": refiner.checkpoint.provenance.config.preset,
         "device": torch.cuda.get_device_name() if refiner.device.type == "cuda" else "cpu",
