@@ -17,6 +17,8 @@ class CleanGroup(click.Group):
         except PoseError as error:
             click.echo(f"Error: {error}", err=True)
             ctx.exit(exit_code(error))
+        except BrokenPipeError:  # `| head` has read enough: click ends quietly
+            raise
         except OSError as error:
             click.echo(f"Error: {storage_error(error.filename or 'storage', error)}", err=True)
             ctx.exit(1)

@@ -16,6 +16,8 @@ class CleanGroup(click.Group):
         except PoseError as error:
             click.echo(f"Error: {error}", err=True)
             ctx.exit(exit_code(error))
+        except BrokenPipeError:  # `| head` has read enough: click ends quietly
+            raise
         except OSError as error:
             from posecore.files import storage_error
 
