@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option
 
 RESULTS = click.Path(path_type=Path, dir_okay=False)
 
@@ -15,13 +15,7 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
 @click.argument("b", type=RESULTS)
 @click.option("--dataset", type=FOLDER, help="BOP dataset folder. Default: the one the files' sidecars name.")
 @split_option
-@click.option(
-    "--vss",
-    type=click.Choice(["full", "visible"]),
-    default="full",
-    show_default=True,
-    help="Whole silhouettes, or their visible parts (needs depth images).",
-)
+@vss_option
 @click.option(
     "--limit",
     type=click.FloatRange(0, min_open=True),

@@ -24,3 +24,10 @@ class Numbers(click.ParamType):
 FOLDER = click.Path(path_type=Path)
 NEW_FILE = click.Path(path_type=Path, dir_okay=False)
 split_option = click.option("--split", help="Split folder. Default: test, val, train_pbr, train or the only one.")
+vss_option = click.option(
+    "--vss",
+    type=click.Choice(["full", "visible"]),
+    default="full",
+    show_default=True,
+    help="Whole silhouettes, or their visible parts (needs depth images).",
+)

@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evalkit.cli.options import FOLDER, split_option
+from evalkit.cli.options import FOLDER, split_option, vss_option
 
 
 @click.command()
@@ -18,13 +18,7 @@ from evalkit.cli.options import FOLDER, split_option
 )
 @click.option("--out", type=FOLDER, default=Path("report"), show_default=True, help="Folder for the report.")
 @split_option
-@click.option(
-    "--vss",
-    type=click.Choice(["full", "visible"]),
-    default="full",
-    show_default=True,
-    help="Whole silhouettes, or their visible parts (needs depth images).",
-)
+@vss_option
 @click.option("--worst", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of worst cases.")
 def report(
     dataset: Path | None,

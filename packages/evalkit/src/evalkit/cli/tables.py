@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option
 
 
 @click.command()
@@ -21,13 +21,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option
     show_default=True,
     help="What has a row of its own and is counted once in totals.",
 )
-@click.option(
-    "--vss",
-    type=click.Choice(["full", "visible"]),
-    default="full",
-    show_default=True,
-    help="Whole silhouettes, or their visible parts (needs depth images).",
-)
+@vss_option
 @click.option(
     "--resamples", type=click.IntRange(0), default=0, show_default=True, help="For 95 % intervals; 1000 are enough."
 )

@@ -146,7 +146,7 @@ def _update(view: View, colours: Colours, pose: Float[Array, "4 4"], length_m: f
     row, column = np.nonzero((np.abs(phi) < BAND_PX) & view.in_image)
     probable = colours.posterior(cv2.GaussianBlur(view.scene_rgb, (0, 0), 0.7))[row, column]
     at = phi[row, column]
-    # Logistic, not the arc tangent of the paper, whose long tails let far pixels push the size: half the error in z.
+    # Logistic, not the arc tangent of the paper, whose long tails let far pixels push the size.
     inside = 1 / (1 + np.exp(-SHARPNESS * at))
     slope = SHARPNESS * inside * (1 - inside)
     likelihood = (inside * probable + (1 - inside) * (1 - probable)).clip(1e-3)
