@@ -77,6 +77,20 @@ def test_hypotheses_are_drawn_within_the_range(mesh):
     assert angles.mean() == pytest.approx(10, abs=1)
 
 
+def test_the_depth_stretch_scales_the_move_along_the_viewing_ray_alone(mesh):
+    T = se3.make_T(np.eye(3), np.array([0.3, -0.2, 0.6]))
+    ray = T[:3, 3] / 0.7
+    for seed in range(20):
+        plain, stretched = (
+            draw_hypothesis(T, mesh.diameter_m, HypothesisConfig(depth_stretch=factor), np.random.default_rng(seed))
+            for factor in (1.0, 5.0)
+        )
+        np.testing.assert_array_equal(plain[:3, :3], stretched[:3, :3])
+        move, stretched_move = plain[:3, 3] - T[:3, 3], stretched[:3, 3] - T[:3, 3]
+        assert stretched_move @ ray == pytest.approx(5 * (move @ ray))
+        np.testing.assert_allclose(np.cross(stretched_move, ray), np.cross(move, ray), atol=1e-12)
+
+
 def test_stored_hypotheses_are_kept_without_fresh_ones(mesh, rasteriser, samples):
     pairs = make_pairs(mesh, rasteriser, samples, fresh=False)
     for k, i in enumerate(pairs.kept):

@@ -108,6 +108,8 @@ class HypothesisConfig:
         fresh: draw and render them anew at every pass; otherwise the shards' own hypotheses are used.
         max_angle_deg: largest rotation; angles are uniform up to it.
         max_translation_diameter: largest move, in object diameters; lengths are uniform up to it.
+        depth_stretch: factor on the part of the move along the viewing ray; detectors that see RGB alone err several
+            times as far in depth as across the image.
         easy_share: share of samples whose angle is scaled down at random, and of those whose distance is,
             independently: what the later iterations of a refinement see.
         in_plane: turn each scene about the optical axis by a random angle.
@@ -116,6 +118,7 @@ class HypothesisConfig:
     fresh: bool = False
     max_angle_deg: float = 25.0
     max_translation_diameter: float = 0.2
+    depth_stretch: float = 1.0
     easy_share: float = 0.3
     in_plane: bool = True
 
@@ -126,6 +129,7 @@ class HypothesisConfig:
             0 <= self.max_translation_diameter <= 2,
             f"max_translation_diameter is {self.max_translation_diameter}, expected 0 to 2",
         )
+        _require(1 <= self.depth_stretch <= 10, f"depth_stretch is {self.depth_stretch}, expected 1 to 10")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -84,6 +84,8 @@ def draw_hypothesis(
 ) -> Float[Array, "4 4"]:
     """A pose near the truth: angle and distance uniform up to the configured ends, axis and direction uniform.
 
+    The part of the move along the ray from the camera to the object's origin is then scaled by `depth_stretch`.
+
     Either may be scaled down alone: after one update a pose is well placed in the image and still turned, so that is
     what the later iterations of a refinement see.
 
@@ -97,7 +99,12 @@ def draw_hypothesis(
     turn, move = (rng.random() if rng.random() < config.easy_share else 1.0 for _ in range(2))
     angle_rad = np.deg2rad(config.max_angle_deg) * reach * turn * rng.random()
     distance_m = config.max_translation_diameter * diameter_m * reach * move * rng.random()
-    return se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
+    drawn = se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
+    if config.depth_stretch != 1:
+        ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
+        along_m = (drawn[:3, 3] - T_cam_obj[:3, 3]) @ ray
+        drawn[:3, 3] += (config.depth_stretch - 1) * along_m * ray
+    return drawn
 
 
 class PairMaker:
