@@ -35,8 +35,8 @@ from experiments.common import (
     small_networks,
 )
 
-# As far as the paper's start poses are off in the mean: 34 degrees, a tenth of a diameter across the image, six times that
-# in depth.
+# As far as the start poses of the paper are off in the mean: 34 degrees, a tenth of a diameter across the image and six
+# times as much in depth.
 REACH = (
     "--set hypothesis.max_angle_deg=60 --set hypothesis.max_translation_diameter=0.35 --set hypothesis.depth_stretch=6"
 )
