@@ -147,7 +147,7 @@ def test_crops_are_the_full_frame(dataset, perfect):
     with Evaluator(dataset) as evaluator:
         evaluator.mesh(TUG)
         views = [View(camera=CAMERA, T_cam_obj=T) for T in poses]
-        patches = silhouette.render_patches(evaluator.rasteriser, TUG, mesh, views)
+        patches = silhouette.render_patches(evaluator.rasteriser, TUG, mesh.vertices_m, views)
         frames = evaluator.rasteriser.render(TUG, CAMERA.K, np.stack(poses), *size, rgb=False).mask
     for patch, frame in zip(patches, frames, strict=True):
         rows, columns = patch.depth_m.shape
@@ -208,7 +208,7 @@ def test_a_file_is_compared_with_the_start_poses_it_came_from():
     def scored(name, **sidecar):
         file = ResultFile(name=name, path=Path(f"{name}.csv"), sha256="", sidecar=sidecar, estimates=[])
         none = np.zeros((0, 4, 4))
-        return Scored(file=file, table=table_of([]), T_est=none, T_gt=none, ignored=0)
+        return Scored(file=file, table=table_of({}), T_est=none, T_gt=none, ignored=0)
 
     starts = [scored("near", method="start"), scored("far", method="start")]
     assert start_of(scored("a", init="far.csv"), starts) is starts[1]

@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from evalkit import metrics
+from evalkit import metrics, pose_errors
 from evalkit.evaluate import Evaluator
 from evalkit.files import load_result_files
 from evalkit.pairing import pair_up
 from hypothesis import given
 from hypothesis import strategies as st
-from posecore import se3
+from posecore import camera, se3
 from posecore.bop import BopDataset, ModelInfo
 from posecore.symmetry import ContinuousSymmetry, symmetry_transforms
 
@@ -115,13 +115,55 @@ def test_a_point_in_the_camera_plane_is_an_infinite_projection_error():
     assert metrics.mspd(T, moved(T, z=1.0), K, np.zeros((1, 3)), IDENTITY) == np.inf
 
 
-def test_mssd_in_chunks_is_mssd(monkeypatch):
-    info = ModelInfo(diameter_m=0.1, symmetries_continuous=(ContinuousSymmetry((0.0, 1.0, 0.0), (0.0, 0.0, 0.0)),))
-    symmetries = symmetry_transforms(info)
-    whole = metrics.mssd(pose(3), pose(4), POINTS, symmetries), metrics.mspd(pose(3), pose(4), K, POINTS, symmetries)
-    monkeypatch.setattr(metrics, "CHUNK_VALUES", 3 * len(POINTS) * 7)
-    parts = metrics.mssd(pose(3), pose(4), POINTS, symmetries), metrics.mspd(pose(3), pose(4), K, POINTS, symmetries)
-    assert whole == parts
+def plain_errors(T_est, T_gt, points_m, symmetries):
+    """The definitions, word for word, with all of a model's symmetric copies at once."""
+    estimated, copies = se3.apply(T_est, points_m), se3.apply(T_gt @ symmetries, points_m)
+    between = np.linalg.norm(copies - estimated, axis=-1)
+    pixels = np.linalg.norm(camera.project(K, copies) - camera.project(K, estimated), axis=-1)
+    to_all = np.linalg.norm(copies[0][:, None] - estimated[None], axis=-1)
+    angles = se3.rotation_angle_rad(np.swapaxes((T_gt @ symmetries)[:, :3, :3], 1, 2) @ T_est[:3, :3])
+    return {
+        "add": between[0].mean(),
+        "adi": to_all.min(axis=1).mean(),
+        "mssd": between.max(axis=1).min(),
+        "mspd": pixels.max(axis=1).min(),
+        "proj": pixels[0].mean(),
+        "proj_sym": pixels.mean(axis=1).min(),
+        "re": angles[0],
+        "re_sym": angles.min(),
+        "te": np.linalg.norm(T_est[:3, 3] - T_gt[:3, 3]),
+    }
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_batches_and_single_poses_follow_the_definitions(symmetric):
+    axis = (ContinuousSymmetry((0.0, 1.0, 0.0), (0.01, 0.0, 0.0)),) if symmetric else ()
+    symmetries = symmetry_transforms(ModelInfo(diameter_m=0.1, symmetries_continuous=axis))
+    T_est, T_gt = np.stack([pose(seed) for seed in range(8)]), np.stack([pose(seed) for seed in range(50, 58)])
+    T_est[0] = moved(T_gt[0] @ symmetries[-1], x=0.001)
+
+    def errors(T_est, T_gt):
+        mspd, proj, proj_sym = metrics.projection_errors(T_est, T_gt, K, POINTS, symmetries)
+        return {
+            "add": metrics.add(T_est, T_gt, POINTS),
+            "adi": metrics.adi(T_est, T_gt, POINTS),
+            "mssd": metrics.mssd(T_est, T_gt, POINTS, symmetries),
+            "mspd": mspd,
+            "proj": proj,
+            "proj_sym": proj_sym,
+            "re": metrics.re(T_est, T_gt),
+            "re_sym": metrics.re_symmetric(T_est, T_gt, symmetries),
+            "te": metrics.te(T_est, T_gt),
+        }
+
+    batch, hull = errors(T_est, T_gt), metrics.mssd(T_est, T_gt, pose_errors.hull(POINTS), symmetries)
+    for index, (estimate, truth) in enumerate(zip(T_est, T_gt, strict=True)):
+        expected, single = plain_errors(estimate, truth, POINTS, symmetries), errors(estimate, truth)
+        for name, value in expected.items():
+            assert batch[name][index] == pytest.approx(value, abs=1e-10)
+            assert single[name].shape == ()
+            assert single[name] == batch[name][index]
+        assert hull[index] == pytest.approx(expected["mssd"], abs=1e-12)
 
 
 def test_vss_of_masks():

@@ -1,39 +1,31 @@
 """Dataset and result files to a table: one row for every expected pose, found or missing."""
 
+import multiprocessing
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
-from posecore.bop import BopDataset, Estimate, GroundTruth, symmetry_transforms
+from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.camera import Camera
-from posecore.errors import DatasetError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.symmetry import align_ball, is_ball
-from scipy.spatial import ConvexHull, QhullError
 
-from evalkit import metrics, silhouette
 from evalkit.files import load_result_files
-from evalkit.pairing import Level, Pair, pair_up
+from evalkit.pairing import Pair, pair_up
+from evalkit.scorer import Scorer
 from evalkit.scores.bop import AllErrors, with_bop19
-from evalkit.scores.definitions import VSD_COLUMNS, VSD_TAUS
-from evalkit.silhouette import Patch, View
+from evalkit.scores.definitions import VSD_COLUMNS
 from evalkit.table import table_of
 
-Array = np.ndarray
 VssKind = Literal["full", "visible"]
 Progress = Callable[[int], None]
-ERRORS = (
-    *("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px"),
-    *("re_rad", "re_sym_rad", "te_m", "dx_m", "dy_m", "dz_m"),
-)
-"""Columns that are NaN where an estimate is missing."""
+BLOCK = 1024
+"""Number of pairs whose renders are held at once, and that a worker gets at once."""
 
 TRUTH_COLUMNS = (
     *("scene_id", "im_id", "obj_id", "gt_index", "visib_fract"),
@@ -41,7 +33,9 @@ TRUTH_COLUMNS = (
 )
 
 
-def evaluate(dataset: str | Path, results: str | Path, *, vss: VssKind = "full", with_vsd: bool = True) -> pd.DataFrame:
+def evaluate(
+    dataset: str | Path, results: str | Path, *, vss: VssKind = "full", with_vsd: bool = True, workers: int = 1
+) -> pd.DataFrame:
     """Errors of the poses in a result file: one row for each expected pose, found or missing.
 
     `evalkit.scores.scores(table)` sums them up; `evalkit.table.COLUMNS` says what each column holds, with its unit.
@@ -54,80 +48,115 @@ def evaluate(dataset: str | Path, results: str | Path, *, vss: VssKind = "full",
         results: BOP result file (CSV), translations in millimetres.
         vss: whole silhouettes, or their visible parts, which needs depth images.
         with_vsd: whether VSD is computed where there is depth.
+        workers: number of processes; the values do not depend on it.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
     """
     opened = BopDataset(dataset)
     (file,) = load_result_files([Path(results)], opened)
-    with Evaluator(opened, vss, with_vsd=with_vsd) as evaluator:
-        table = evaluator.evaluate(pair_up(opened, file).pairs)
+    with Evaluator(opened, vss, with_vsd=with_vsd, workers=workers) as evaluator:
+        pairs = pair_up(opened, file).pairs
+        table = evaluator.evaluate(pairs)
         if "perturbation" in file.sidecar:
             return table
-        return with_bop19(table, evaluator.all_errors(file.estimates))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Model:
-    mesh: Mesh
-    hull_m: Float[Array, "h 3"]
-    symmetries: Float[Array, "s 4 4"]
+        return with_bop19(table, evaluator.all_errors(file.estimates, known=(pairs, table)))
 
 
 class Evaluator:
     """Scores pairs against one dataset; true silhouettes are rendered once for all result files."""
 
-    def __init__(self, dataset: BopDataset, vss: VssKind = "full", *, with_vsd: bool = True) -> None:
+    def __init__(self, dataset: BopDataset, vss: VssKind = "full", *, with_vsd: bool = True, workers: int = 1) -> None:
         """Open a renderer for the dataset's models (`models_eval` where there is one).
 
         Args:
             dataset: with ground truth.
             vss: whole silhouettes, or their visible parts, which needs depth images.
             with_vsd: whether VSD is added where an image has depth, in columns `vsd_0.05` ... `vsd_0.50`.
+            workers: number of processes that score; the values do not depend on it.
         """
-        self.dataset, self.vss, self.with_vsd = dataset, vss, with_vsd
-        self._depth: tuple[tuple[int, int], Float[Array, "h w"] | None] | None = None
-        self.rasteriser = Rasteriser({})
-        self._models: dict[int, _Model] = {}
-        self._true_patches: dict[tuple[int, int, int], Patch] = {}
-        self._cameras: dict[tuple[int, int], Camera] = {}
+        self.dataset, self.vss, self.with_vsd, self.workers = dataset, vss, with_vsd, workers
+        self._scorer = Scorer(dataset, visible=vss == "visible", with_vsd=with_vsd)
+        self._pool: ProcessPoolExecutor | None = None
 
     def __enter__(self) -> "Evaluator":
         """Use in a with statement."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        """Free the renderer."""
-        self.rasteriser.close()
+        """Free the renderer and end the workers."""
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        self._scorer.rasteriser.close()
+
+    @property
+    def rasteriser(self) -> Rasteriser:
+        """Has the meshes of all objects asked for so far."""
+        return self._scorer.rasteriser
 
     def evaluate(self, pairs: Sequence[Pair], advance: Progress = lambda done: None) -> pd.DataFrame:
         """Score pairs, in their order; `advance` is called with the number of pairs done since the last call.
 
+        Memory beside the table does not grow with the number of pairs: they are scored in blocks, image by image.
+
         Raises:
             DatasetError: a model is missing, or VSS of visible parts is wanted and an image has no depth.
         """
-        values, vsd = self._silhouette_errors(pairs)
-        rows = []
-        for pair, value in zip(pairs, values, strict=True):
-            rows.append(self._row(pair, value))
-            advance(1)
-        table = table_of(rows)
-        if self.with_vsd and np.isfinite(vsd).any():
-            table[list(VSD_COLUMNS)] = vsd
+        if not pairs:
+            return table_of({})
+        order = sorted(range(len(pairs)), key=lambda index: (pairs[index].scene_id, pairs[index].im_id))
+        size = min(BLOCK, -(-len(pairs) // self.workers))
+        blocks = [[pairs[index] for index in order[start : start + size]] for start in range(0, len(pairs), size)]
+        parts: list[pd.DataFrame | None] = [None] * len(blocks)
+        for place, part in self._scored(blocks):
+            parts[place] = part
+            advance(len(part))
+        table = pd.concat([part for part in parts if part is not None], ignore_index=True)
+        table = table.iloc[np.argsort(order)].reset_index(drop=True)
+        if self.with_vsd and table[list(VSD_COLUMNS)].isna().all(axis=None):
+            table = table.drop(columns=list(VSD_COLUMNS))
         return table
 
-    def all_errors(self, estimates: Sequence[Estimate]) -> AllErrors:
+    def _scored(self, blocks: Sequence[Sequence[Pair]]) -> Iterator[tuple[int, pd.DataFrame]]:
+        """Each block's place and its table, as they are done."""
+        if self.workers == 1 or len(blocks) == 1:
+            yield from ((place, self._scorer.score(block)) for place, block in enumerate(blocks))
+            return
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(
+                self.workers,
+                mp_context=multiprocessing.get_context("spawn"),
+                initializer=_start_worker,
+                initargs=(self.dataset.root, self.dataset.split, self.dataset.sensor, self.vss, self.with_vsd),
+            )
+        waiting = dict(reversed(list(enumerate(blocks))))
+        running: dict[Future[pd.DataFrame], int] = {}
+        while waiting or running:
+            while waiting and len(running) <= self.workers:  # one more than run, so that none waits for its pairs
+                place, block = waiting.popitem()
+                running[self._pool.submit(_score_in_worker, block)] = place
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield running.pop(future), future.result()
+
+    def all_errors(
+        self, estimates: Sequence[Estimate], known: tuple[Sequence[Pair], pd.DataFrame] | None = None
+    ) -> AllErrors:
         """Every estimate in the targets' images against every true instance of its object: what BOP19 and BOP24 match.
 
         Args:
             estimates: of a result file; those in other images are left out.
+            known: pairs of these estimates that were scored before, and what `evaluate` returned for them.
         """
         asked = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in self.dataset.targets}
         images = list(dict.fromkeys(key[:2] for key in asked))
         truths = [
-            (*image, gt) for image in images for gt in self.dataset.gt(*image) if gt.has_pose and gt.obj_id in self._ids
+            (*image, gt)
+            for image in images
+            for gt in self._scorer.gt(*image)
+            if gt.has_pose and gt.obj_id in self.dataset.models_info
         ]
-        kept = [estimate for estimate in estimates if (estimate.scene_id, estimate.im_id) in set(images)]
+        wanted = set(images)
+        kept = [estimate for estimate in estimates if (estimate.scene_id, estimate.im_id) in wanted]
         places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
         for place, (scene_id, im_id, gt) in enumerate(truths):
             places[scene_id, im_id, gt.obj_id].append(place)
@@ -137,7 +166,7 @@ class Evaluator:
                 scene_id, im_id, gt = truths[place]
                 pairs.append(Pair(scene_id=scene_id, im_id=im_id, truth=gt, estimate=estimate))
                 ends.append((index, place))
-        errors = self.evaluate(pairs)
+        errors = self._reusing(pairs, known)
         columns = ["mssd_m", "mspd_px", *(name for name in VSD_COLUMNS if name in errors)]
         errors = errors[columns].copy()
         if not errors.reindex(columns=list(VSD_COLUMNS)).notna().all(axis=None):
@@ -156,6 +185,17 @@ class Evaluator:
             errors=errors,
         )
 
+    def _reusing(self, pairs: Sequence[Pair], known: tuple[Sequence[Pair], pd.DataFrame] | None) -> pd.DataFrame:
+        """`evaluate`, with the rows of pairs that are known taken over."""
+        if known is None:
+            return self.evaluate(pairs)
+        rows = {(id(pair.estimate), pair.truth.gt_index): row for row, pair in enumerate(known[0]) if pair.estimate}
+        found = [rows.get((id(pair.estimate), pair.truth.gt_index), -1) for pair in pairs]
+        fresh = self.evaluate([pair for pair, row in zip(pairs, found, strict=True) if row < 0])
+        place = np.array(found, np.int64)
+        place[place < 0] = len(known[1]) + np.arange(len(fresh))
+        return pd.concat([known[1], fresh], ignore_index=True).iloc[place].reset_index(drop=True)
+
     def _truth_row(
         self, scene_id: int, im_id: int, gt: GroundTruth, asked: Mapping[tuple[int, int, int], int]
     ) -> tuple[Any, ...]:
@@ -165,169 +205,23 @@ class Evaluator:
         width_px = self.camera(scene_id, im_id).width_px
         return scene_id, im_id, gt.obj_id, gt.gt_index, visible, count, diameter_m, width_px
 
-    @property
-    def _ids(self) -> set[int]:
-        return set(self.dataset.models_info)
-
     def camera(self, scene_id: int, im_id: int) -> Camera:
-        """Intrinsics of an image, read once."""
-        if (scene_id, im_id) not in self._cameras:
-            self._cameras[scene_id, im_id] = self.dataset.camera(scene_id, im_id)
-        return self._cameras[scene_id, im_id]
+        """Intrinsics of an image."""
+        return self._scorer.camera(scene_id, im_id)
 
     def mesh(self, obj_id: int) -> Mesh:
         """The model that errors are measured on."""
-        return self._model(obj_id).mesh
-
-    def _model(self, obj_id: int) -> _Model:
-        if obj_id not in self._models:
-            if obj_id not in self.dataset.models_info:
-                raise DatasetError(f"{self.dataset.root}: models_info.json has no object {obj_id}; add its diameter")
-            mesh = self.dataset.mesh(obj_id, eval=True)
-            self.rasteriser.add(obj_id, mesh)
-            self._models[obj_id] = _Model(
-                mesh=mesh,
-                hull_m=_hull(mesh.vertices_m),
-                symmetries=symmetry_transforms(self.dataset.models_info[obj_id]),
-            )
-        return self._models[obj_id]
-
-    def _silhouette_errors(self, pairs: Sequence[Pair]) -> tuple[list[float], Float[Array, "n t"]]:
-        """VSS of each pair, 0 where missing, and VSD for every tolerance, NaN where missing or without depth."""
-        self._render_truths(pairs)
-        values, vsd = [0.0] * len(pairs), np.full((len(pairs), len(VSD_TAUS)), np.nan)
-        patches_of: dict[int, Patch] = {}
-        for obj_id, indices in _by_object(pairs, lambda pair: pair.estimate is not None):
-            views = [self._view(pairs[index], estimated=True) for index in indices]
-            patches = silhouette.render_patches(self.rasteriser, obj_id, self.mesh(obj_id), views)
-            patches_of |= zip(indices, patches, strict=True)
-        for index, patch in sorted(
-            patches_of.items(), key=lambda item: (pairs[item[0]].scene_id, pairs[item[0]].im_id)
-        ):
-            values[index], vsd[index] = self._compare(pairs[index], patch)
-        return values, vsd
-
-    def _render_truths(self, pairs: Sequence[Pair]) -> None:
-        fresh = {_truth_key(pair): pair for pair in pairs if _truth_key(pair) not in self._true_patches}
-        missing = list(fresh.values())
-        for obj_id, indices in _by_object(missing, lambda pair: True):
-            views = [self._view(missing[index], estimated=False) for index in indices]
-            patches = silhouette.render_patches(self.rasteriser, obj_id, self.mesh(obj_id), views)
-            for index, patch in zip(indices, patches, strict=True):
-                self._true_patches[_truth_key(missing[index])] = patch
-
-    def _view(self, pair: Pair, *, estimated: bool) -> View:
-        self._model(pair.truth.obj_id)
-        pose = pair.estimate.T_cam_obj if estimated and pair.estimate is not None else pair.truth.T_cam_obj
-        return View(camera=self.camera(pair.scene_id, pair.im_id), T_cam_obj=pose)
-
-    def _compare(self, pair: Pair, patch: Patch) -> tuple[float, Float[Array, " t"]]:
-        true, K = self._true_patches[_truth_key(pair)], self.camera(pair.scene_id, pair.im_id).K
-        vss = silhouette.vss_full(patch, true) if self.vss == "full" else np.nan
-        depth_m = self._depth_m(pair.scene_id, pair.im_id) if self.vss == "visible" or self.with_vsd else None
-        if depth_m is None:
-            if self.vss == "full":
-                return vss, np.full(len(VSD_TAUS), np.nan)
-            scene = self.dataset.scene_path(pair.scene_id)
-            raise DatasetError(
-                f"{scene / 'depth'}: image {pair.im_id} has no depth, which --vss visible needs; use --vss full"
-            )
-        if self.vss == "visible":
-            vss = silhouette.vss_visible(patch, true, K, depth_m)
-        if not self.with_vsd:
-            return vss, np.full(len(VSD_TAUS), np.nan)
-        taus_m = VSD_TAUS * self.dataset.models_info[pair.truth.obj_id].diameter_m
-        return vss, silhouette.vsd(patch, true, K, depth_m, taus_m)
-
-    def _depth_m(self, scene_id: int, im_id: int) -> Float[Array, "h w"] | None:
-        """Depth of an image; the last one is kept, as pairs come image by image."""
-        if self._depth is None or self._depth[0] != (scene_id, im_id):
-            self._depth = (scene_id, im_id), self.dataset.depth_m(scene_id, im_id)
-        return self._depth[1]
-
-    def _row(self, pair: Pair, vss: float) -> dict[str, Any]:
-        truth, estimate = pair.truth, pair.estimate
-        info = self.dataset.models_info[truth.obj_id]
-        level = pair.level or Level(angle_deg=np.nan, translation_diameter=np.nan)
-        camera = self.camera(pair.scene_id, pair.im_id)
-        azimuth_deg, elevation_deg = metrics.viewpoint_deg(truth.T_cam_obj)
-        return {
-            "scene_id": pair.scene_id,
-            "im_id": pair.im_id,
-            "obj_id": truth.obj_id,
-            "gt_index": truth.gt_index,
-            "visib_fract": np.nan if truth.visib_fract is None else truth.visib_fract,
-            "found": estimate is not None,
-            "line": 0 if estimate is None else estimate.line,
-            "score": np.nan if estimate is None else estimate.score,
-            "time_s": np.nan if estimate is None else estimate.time_s,
-            "start_angle_deg": level.angle_deg,
-            "start_translation_diameter": level.translation_diameter,
-            "diameter_m": info.diameter_m,
-            "symmetric": info.is_symmetric,
-            "image_width_px": camera.width_px,
-            "distance_m": float(truth.T_cam_obj[2, 3]),
-            "view_azimuth_deg": azimuth_deg,
-            "view_elevation_deg": elevation_deg,
-            "other_mssd_m": self._other_mssd_m(pair),
-            "vss": vss,
-            **(dict.fromkeys(ERRORS, np.nan) if estimate is None else self._errors(estimate.T_cam_obj, truth, camera)),
-        }
-
-    def _other_mssd_m(self, pair: Pair) -> float:
-        """Smallest MSSD to another true instance of the object in the image."""
-        truth, estimate = pair.truth, pair.estimate
-        if estimate is None:
-            return np.nan
-        others = [
-            gt
-            for gt in self.dataset.gt(pair.scene_id, pair.im_id)
-            if gt.obj_id == truth.obj_id and gt.has_pose and gt.gt_index != truth.gt_index
-        ]
-        model = self._model(truth.obj_id)
-        return min(
-            (metrics.mssd(estimate.T_cam_obj, gt.T_cam_obj, model.hull_m, model.symmetries) for gt in others),
-            default=np.nan,
-        )
-
-    def _errors(self, T_est: Float[Array, "4 4"], truth: GroundTruth, camera: Camera) -> dict[str, float]:
-        T_gt, model = truth.T_cam_obj, self._model(truth.obj_id)
-        points_m, symmetries = model.mesh.vertices_m, model.symmetries
-        continuous = self.dataset.models_info[truth.obj_id].symmetries_continuous
-        if is_ball(continuous):
-            symmetries = np.stack([np.eye(4), align_ball(continuous, T_gt, T_est)])
-        mspd_px, proj_px, proj_sym_px = metrics.projection_errors(T_est, T_gt, camera.K, points_m, symmetries)
-        dx_m, dy_m, dz_m = (float(value) for value in metrics.te_axes(T_est, T_gt))
-        return {
-            "add_m": metrics.add(T_est, T_gt, points_m),
-            "adi_m": metrics.adi(T_est, T_gt, points_m),
-            "mssd_m": metrics.mssd(T_est, T_gt, model.hull_m, symmetries),
-            "mspd_px": mspd_px,
-            "proj_px": proj_px,
-            "proj_sym_px": proj_sym_px,
-            "re_rad": metrics.re(T_est, T_gt),
-            "re_sym_rad": metrics.re_symmetric(T_est, T_gt, symmetries),
-            "te_m": metrics.te(T_est, T_gt),
-            "dx_m": dx_m,
-            "dy_m": dy_m,
-            "dz_m": dz_m,
-        }
+        return self._scorer.model(obj_id).mesh
 
 
-def _truth_key(pair: Pair) -> tuple[int, int, int]:
-    return pair.scene_id, pair.im_id, pair.truth.gt_index
+_worker: Scorer | None = None
 
 
-def _by_object(pairs: Sequence[Pair], wanted: Callable[[Pair], bool]) -> Iterator[tuple[int, list[int]]]:
-    indices: dict[int, list[int]] = defaultdict(list)
-    for index, pair in enumerate(pairs):
-        if wanted(pair):
-            indices[pair.truth.obj_id].append(index)
-    yield from sorted(indices.items())
+def _start_worker(root: Path, split: str, sensor: str | None, vss: VssKind, with_vsd: bool) -> None:
+    global _worker
+    _worker = Scorer(BopDataset(root, split, sensor), visible=vss == "visible", with_vsd=with_vsd)
 
 
-def _hull(points_m: Float[Array, "n 3"]) -> Float[Array, "h 3"]:
-    try:
-        return np.asarray(points_m[ConvexHull(points_m).vertices])
-    except QhullError:  # a flat model has no hull: all its points are kept
-        return points_m
+def _score_in_worker(block: Sequence[Pair]) -> pd.DataFrame:
+    assert _worker is not None
+    return _worker.score(block)

@@ -1,107 +1,93 @@
 """Pose errors, one function each. Metres, pixels and radians; definitions and names are those of bop_toolkit.
 
-`T_est` and `T_gt` are (4, 4) poses `T_cam_obj`; `points_m` are the model's vertices in the object frame; `symmetries`
-are the object's transforms of `posecore.symmetry.symmetry_transforms`, the identity among them.
+`T_est` and `T_gt` are poses `T_cam_obj`: one, (4, 4), or a batch, (b, 4, 4); results are of shape () or (b,).
+`points_m` are the model's vertices in the object frame; `symmetries` are the object's transforms of
+`posecore.symmetry.symmetry_transforms`, (s, 4, 4), the identity first, or (b, s, 4, 4) where each pose has its own.
 
 Sources: Hodan et al., "On Evaluation of 6D Object Pose Estimation", ECCVW 2016, and "BOP Challenge 2020", ECCVW 2020.
 """
 
 import numpy as np
 from jaxtyping import Bool, Float
-from posecore import camera, se3
-from scipy.spatial import cKDTree
+
+from evalkit import kernels
+from evalkit.nearest import NearestPoints
 
 Array = np.ndarray
-Pose = Float[Array, "4 4"]
+Poses = Float[Array, "*b 4 4"]
+Errors = Float[Array, "*b"]
+Points = Float[Array, "n 3"]
+Symmetries = Float[Array, "*g s 4 4"]
 BOP_RAY_PX = 0.0
 """Where in a pixel bop_toolkit's rays go through when it turns depth into distance."""
-CHUNK_VALUES = 3_000_000
-"""Largest number of floats held at once when a model is moved by every symmetry."""
 
 
-def add(T_est: Pose, T_gt: Pose, points_m: Float[Array, "n 3"]) -> float:
+def add(T_est: Poses, T_gt: Poses, points_m: Points) -> Errors:
     """Average distance between corresponding model points (ADD), metres."""
-    return float(np.linalg.norm(se3.apply(T_est, points_m) - se3.apply(T_gt, points_m), axis=1).mean())
+    return _per_pose(kernels.mean_distance(_flat(T_est), _flat(T_gt), _packed(points_m)), T_est)
 
 
-def adi(T_est: Pose, T_gt: Pose, points_m: Float[Array, "n 3"]) -> float:
-    """Average distance from each true model point to the nearest estimated one (ADI, also ADD-S), metres."""
-    # The tree is built in the camera frame, not once in the object frame: annotations are not exactly orthonormal.
-    tree = cKDTree(se3.apply(T_est, points_m), leafsize=64, balanced_tree=False, compact_nodes=False)
-    distances, _ = tree.query(se3.apply(T_gt, points_m))
-    return float(np.mean(distances))
+def adi(T_est: Poses, T_gt: Poses, points: Points | NearestPoints) -> Errors:
+    """Average distance from each true model point to the nearest estimated one (ADI, also ADD-S), metres.
+
+    `NearestPoints` instead of the vertices keeps what the search makes of them.
+    """
+    nearest = points if isinstance(points, NearestPoints) else NearestPoints(points)
+    return _per_pose(nearest.mean_distance_m(_flat(T_est), _flat(T_gt)), T_est)
 
 
-def mssd(T_est: Pose, T_gt: Pose, points_m: Float[Array, "n 3"], symmetries: Float[Array, "s 4 4"]) -> float:
+def mssd(T_est: Poses, T_gt: Poses, points_m: Points, symmetries: Symmetries) -> Errors:
     """Maximum distance between corresponding points, at the best symmetry (MSSD), metres.
 
     The largest distance under an affine map is at a vertex of the convex hull: the hull's vertices give the same value.
     """
-    estimated = se3.apply(T_est, points_m)
-    worst = [
-        np.linalg.norm(se3.apply(T_gt @ part, points_m) - estimated, axis=2).max(axis=1)
-        for part in _chunks(symmetries, len(points_m))
-    ]
-    return float(np.concatenate(worst).min())
+    turns = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
+    return _per_pose(kernels.max_distance(_flat(T_est), _flat(T_gt), _packed(points_m), turns), T_est)
 
 
-def mspd(
-    T_est: Pose,
-    T_gt: Pose,
-    K: Float[Array, "3 3"],
-    points_m: Float[Array, "n 3"],
-    symmetries: Float[Array, "s 4 4"],
-) -> float:
+def mspd(T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points, symmetries: Symmetries) -> Errors:
     """Maximum distance between projected points, at the best symmetry (MSPD), pixels."""
-    return float(_projected_distances(T_est, T_gt, K, points_m, symmetries)[0].min())
+    return projection_errors(T_est, T_gt, K, points_m, symmetries)[0]
 
 
-def proj(T_est: Pose, T_gt: Pose, K: Float[Array, "3 3"], points_m: Float[Array, "n 3"]) -> float:
+def proj(T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points) -> Errors:
     """Average distance between projected points, without symmetries, pixels."""
-    return float(_projected_distances(T_est, T_gt, K, points_m, np.eye(4)[None])[1][0])
+    return projection_errors(T_est, T_gt, K, points_m, np.eye(4)[None])[1]
 
 
 def projection_errors(
-    T_est: Pose,
-    T_gt: Pose,
-    K: Float[Array, "3 3"],
-    points_m: Float[Array, "n 3"],
-    symmetries: Float[Array, "s 4 4"],
-) -> tuple[float, float, float]:
-    """MSPD, `proj`, and `proj` at the best symmetry in one pass, pixels. The identity comes first in `symmetries`."""
-    largest, average = _projected_distances(T_est, T_gt, K, points_m, symmetries)
-    return float(largest.min()), float(average[0]), float(average.min())
+    T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points, symmetries: Symmetries
+) -> tuple[Errors, Errors, Errors]:
+    """MSPD, `proj`, and `proj` at the best symmetry in one pass, pixels.
+
+    They are infinite where a point lies in the camera's plane; points behind it are mirrored, as in bop_toolkit.
+    """
+    turns = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
+    K_of_each = np.ascontiguousarray(np.broadcast_to(_flat(K), (len(_flat(T_est)), 3, 3)))
+    errors = kernels.projected_distances(_flat(T_est), _flat(T_gt), K_of_each, _packed(points_m), turns)
+    largest, average, average_best = (_per_pose(values, T_est) for values in errors.T)
+    return largest, average, average_best
 
 
-def _projected_distances(
-    T_est: Pose,
-    T_gt: Pose,
-    K: Float[Array, "3 3"],
-    points_m: Float[Array, "n 3"],
-    symmetries: Float[Array, "s 4 4"],
-) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
-    """Largest and average projected distance for each symmetry; infinite where a point lies in the camera's plane."""
-    estimated = camera.project(K, se3.apply(T_est, points_m))
-    largest, average = [], []
-    for part in _chunks(symmetries, len(points_m)):
-        true = camera.project(K, se3.apply(T_gt @ part, points_m))
-        distances = np.nan_to_num(np.linalg.norm(true - estimated, axis=2), nan=np.inf)
-        largest.append(distances.max(axis=1))
-        average.append(distances.mean(axis=1))
-    return np.concatenate(largest), np.concatenate(average)
+def _packed(values: Float[Array, "*s"]) -> Float[Array, "*s"]:
+    """In the layout and precision the compiled loops take."""
+    return np.ascontiguousarray(values, np.float64)
 
 
-def _chunks(symmetries: Float[Array, "s 4 4"], points: int) -> list[Float[Array, "c 4 4"]]:
-    count = max(1, CHUNK_VALUES // (3 * points))
-    return [symmetries[start : start + count] for start in range(0, len(symmetries), count)]
+def _flat(matrices: Float[Array, "*b r c"]) -> Float[Array, "f r c"]:
+    return _packed(matrices).reshape(-1, *matrices.shape[-2:])
 
 
-def re(T_est: Pose, T_gt: Pose) -> float:
+def _per_pose(errors: Float[Array, " f"], T_est: Poses) -> Errors:
+    return np.asarray(errors).reshape(T_est.shape[:-2])
+
+
+def re(T_est: Poses, T_gt: Poses) -> Errors:
     """Angle of the rotation between two poses, without symmetries, radians in [0, pi]."""
-    return float(_angle_rad(T_est[:3, :3], T_gt[:3, :3]))
+    return _angle_rad(T_est[..., :3, :3], T_gt[..., :3, :3])
 
 
-def _angle_rad(R_est: Float[Array, "3 3"], R_gt: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
+def _angle_rad(R_est: Float[Array, "*a 3 3"], R_gt: Float[Array, "*b 3 3"]) -> Float[Array, "*c"]:
     """Angle of R_est R_gt^-1, exactly 0 where both are the same: only what differs from the identity is computed."""
     D = (R_est - R_gt) @ _inverse(R_gt)
     skew = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
@@ -116,26 +102,26 @@ def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     return np.asarray(np.stack(columns, axis=-1) / determinant[..., None, None])
 
 
-def re_symmetric(T_est: Pose, T_gt: Pose, symmetries: Float[Array, "s 4 4"]) -> float:
+def re_symmetric(T_est: Poses, T_gt: Poses, symmetries: Symmetries) -> Errors:
     """The same angle at the best symmetry, radians."""
-    true = T_gt[:3, :3] @ symmetries[:, :3, :3]
-    return float(_angle_rad(T_est[:3, :3], true).min())
+    true = T_gt[..., None, :3, :3] @ symmetries[..., :3, :3]
+    return np.asarray(_angle_rad(T_est[..., None, :3, :3], true).min(axis=-1))
 
 
-def te(T_est: Pose, T_gt: Pose) -> float:
+def te(T_est: Poses, T_gt: Poses) -> Errors:
     """Distance between the object's origins, metres."""
-    return float(np.linalg.norm(te_axes(T_est, T_gt)))
+    return np.asarray(np.linalg.norm(te_axes(T_est, T_gt), axis=-1))
 
 
-def te_axes(T_est: Pose, T_gt: Pose) -> Float[Array, "3"]:
+def te_axes(T_est: Poses, T_gt: Poses) -> Float[Array, "*b 3"]:
     """Estimated minus true origin along the camera's x (right), y (down) and z (forward), metres, signed."""
-    return np.asarray(T_est[:3, 3] - T_gt[:3, 3])
+    return np.asarray(T_est[..., :3, 3] - T_gt[..., :3, 3])
 
 
-def viewpoint_deg(T_cam_obj: Pose) -> tuple[float, float]:
+def viewpoint_deg(T_cam_obj: Poses) -> tuple[Errors, Errors]:
     """Direction of the camera seen from the object, degrees: azimuth about z from x, elevation over the xy plane."""
-    x, y, z = -_inverse(T_cam_obj[:3, :3]) @ T_cam_obj[:3, 3]
-    return float(np.rad2deg(np.arctan2(y, x))), float(np.rad2deg(np.arctan2(z, np.hypot(x, y))))
+    x, y, z = np.moveaxis(-(_inverse(T_cam_obj[..., :3, :3]) @ T_cam_obj[..., :3, 3:])[..., 0], -1, 0)
+    return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
 
 
 def vss(mask_est: Bool[Array, "h w"], mask_gt: Bool[Array, "h w"]) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from posecore.camera import Camera
-from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.window import silhouette_box
 
@@ -41,12 +40,20 @@ class View:
     T_cam_obj: Float[Array, "4 4"]
 
 
-def render_patches(rasteriser: Rasteriser, obj_id: int, mesh: Mesh, views: Sequence[View]) -> list[Patch]:
+def render_patches(
+    rasteriser: Rasteriser, obj_id: int, outline_m: Float[Array, "n 3"], views: Sequence[View]
+) -> list[Patch]:
     """Render one object at many poses; only what lies inside each image is kept.
 
     Pixels are those of a full-frame render: the crop moves the principal point by whole pixels.
+
+    Args:
+        rasteriser: has the object's mesh.
+        obj_id: which mesh.
+        outline_m: points that the mesh lies between: its vertices, or those of its convex hull, which are fewer.
+        views: poses and cameras.
     """
-    tiles = [_tile(mesh, view) for view in views]
+    tiles = [_tile(outline_m, view) for view in views]
     by_side: dict[int, list[int]] = defaultdict(list)
     for index, (_, _, side) in enumerate(tiles):
         by_side[side].append(index)
@@ -68,10 +75,10 @@ def render_patches(rasteriser: Rasteriser, obj_id: int, mesh: Mesh, views: Seque
     return [patch for patch in patches if patch is not None]
 
 
-def _tile(mesh: Mesh, view: View) -> tuple[int, int, int]:
+def _tile(outline_m: Float[Array, "n 3"], view: View) -> tuple[int, int, int]:
     """Left, top and side of a square that covers the object's part of the image; side 0 where there is none."""
     width, height = view.camera.width_px, view.camera.height_px
-    left, top, right, bottom = silhouette_box(mesh.vertices_m, view.camera.K, view.T_cam_obj)
+    left, top, right, bottom = silhouette_box(outline_m, view.camera.K, view.T_cam_obj)
     x0, y0 = int(max(np.floor(left) - 1, 0)) if left > 0 else 0, int(max(np.floor(top) - 1, 0)) if top > 0 else 0
     x1 = int(min(np.ceil(right) + 1, width)) if right < width else width
     y1 = int(min(np.ceil(bottom) + 1, height)) if bottom < height else height

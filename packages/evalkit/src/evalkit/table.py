@@ -67,9 +67,9 @@ COLUMNS: Mapping[str, Column] = {
 }
 
 
-def table_of(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """A table from one mapping a row, every column of `COLUMNS` in it and maybe others (VSD's)."""
-    table = pd.DataFrame.from_records(list(rows), columns=list(rows[0]) if rows else list(COLUMNS))
+def table_of(columns: Mapping[str, Sequence[Any] | Array]) -> pd.DataFrame:
+    """A table from its columns, all of `COLUMNS` and maybe others (VSD's); an empty one from none."""
+    table = pd.DataFrame(dict(columns) if columns else {name: [] for name in COLUMNS})
     return table.astype({name: column.dtype for name, column in COLUMNS.items()})
 
 

@@ -75,6 +75,27 @@ void main() {
 }
 """
 
+# Where no colours are asked for: a triangle that has less to interpolate costs the software renderer less.
+DEPTH_VERTEX_SHADER = """
+#version 330
+uniform mat4 clip_from_cam;
+uniform mat4 cam_from_obj;
+in vec3 position;
+out float z_cam;
+void main() {
+    vec4 p = cam_from_obj * vec4(position, 1.0);
+    z_cam = p.z;
+    gl_Position = clip_from_cam * p;
+}
+"""
+
+DEPTH_FRAGMENT_SHADER = """
+#version 330
+in float z_cam;
+layout(location = 0) out float depth;
+void main() { depth = z_cam; }
+"""
+
 
 @dataclass(frozen=True, kw_only=True)
 class DirectionalLight:
@@ -175,10 +196,13 @@ class Rasteriser:
         self._meshes = dict(meshes)
         self._context = _thread_context()
         self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
-        self._arrays: dict[int, moderngl.VertexArray] = {}
+        self._depth_program: Any = self._context.program(
+            vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=DEPTH_FRAGMENT_SHADER
+        )
+        self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
         self._textures: dict[int, moderngl.Texture] = {}
         self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
-        self._targets: dict[tuple[int, int], moderngl.Framebuffer] = {}
+        self._targets: dict[tuple[int, int, bool], moderngl.Framebuffer] = {}
 
     def __enter__(self) -> "Rasteriser":
         return self
@@ -241,22 +265,23 @@ class Rasteriser:
         depth = np.empty((n, height_px, width_px), np.float32)
         columns = max(1, ATLAS_SIDE_PX // width_px)
         rows = max(1, ATLAS_SIDE_PX // height_px)
-        self._set_shading(shading)
+        if rgb:
+            self._set_shading(shading)
         for start in range(0, n, columns * rows):
             stop = min(start + columns * rows, n)
             used_columns = min(columns, stop - start)
             used_rows = -(-(stop - start) // used_columns)
-            target = self._begin(used_columns * width_px, used_rows * height_px)
+            target = self._begin(used_columns * width_px, used_rows * height_px, rgb=rgb)
             for i in range(start, stop):
                 row, column = divmod(i - start, used_columns)
                 target.viewport = (column * width_px, row * height_px, width_px, height_px)
                 instance = Instance(obj_id=obj_id, T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], width_px, height_px, near_m=self._near_m([instance]))
+                self._draw(instance, 0, K[i], width_px, height_px, near_m=self._near_m([instance]), rgb=rgb)
             size = (used_columns * width_px, used_rows * height_px)
-            atlas_depth = _tiles(self._read(target, size, 1)[..., :1], used_rows, used_columns)[: stop - start]
-            depth[start:stop] = atlas_depth[..., 0]
+            atlas_depth = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., :1]
+            depth[start:stop] = _tiles(atlas_depth, used_rows, used_columns)[: stop - start, ..., 0]
             if colours is not None:
-                colours[start:stop] = _tiles(self._read(target, size, 0), used_rows, used_columns)[: stop - start]
+                colours[start:stop] = _tiles(self._read_rgb(target, size), used_rows, used_columns)[: stop - start]
         return Layers(rgb=colours, depth_m=depth)
 
     def render_scene(
@@ -272,13 +297,13 @@ class Rasteriser:
         """Draw several objects into one image."""
         self._context.__enter__()
         self._set_shading(shading)
-        target = self._begin(width_px, height_px)
+        target = self._begin(width_px, height_px, rgb=True)
         target.viewport = (0, 0, width_px, height_px)
         near_m = self._near_m(instances)  # one depth range for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m, rgb=True)
         size = (width_px, height_px)
-        colours, layer = self._read(target, size, 0).copy() if rgb else None, self._read(target, size, 1)
+        colours, layer = self._read_rgb(target, size).copy() if rgb else None, self._read_floats(target, size, 1, 2)
         return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
 
     def _set_shading(self, shading: Shading) -> None:
@@ -289,27 +314,35 @@ class Rasteriser:
         program["light_direction"].value = [light.direction_cam for light in lights] + padding
         program["light_rgb"].value = [light.rgb for light in lights] + padding
 
-    def _begin(self, width_px: int, height_px: int) -> moderngl.Framebuffer:
-        target = self._targets.get((width_px, height_px))
+    def _begin(self, width_px: int, height_px: int, *, rgb: bool) -> moderngl.Framebuffer:
+        target = self._targets.get((width_px, height_px, rgb))
         if target is None:
             if len(self._targets) >= 8:  # sizes vary with batch and crop; a few are kept, the oldest goes
                 self._free(self._targets.pop(next(iter(self._targets))))
             size = (width_px, height_px)
+            colours = [self._context.texture(size, 4), self._context.texture(size, 2, dtype="f4")]
             target = self._context.framebuffer(
-                [self._context.texture(size, 4), self._context.texture(size, 2, dtype="f4")],
-                self._context.depth_texture(size),
+                colours if rgb else [self._context.texture(size, 1, dtype="f4")], self._context.depth_texture(size)
             )
-            self._targets[width_px, height_px] = target
+            self._targets[width_px, height_px, rgb] = target
         target.use()
         target.viewport = (0, 0, width_px, height_px)
         target.clear(0.0, 0.0, 0.0, 0.0)
         return target
 
     def _draw(
-        self, instance: Instance, label: int, K: Float[Array, "3 3"], width_px: int, height_px: int, near_m: float
+        self,
+        instance: Instance,
+        label: int,
+        K: Float[Array, "3 3"],
+        width_px: int,
+        height_px: int,
+        near_m: float,
+        *,
+        rgb: bool,
     ) -> None:
         mesh = self._mesh(instance.obj_id)
-        array = self._array(instance.obj_id, mesh)
+        coloured, depth_only = self._array(instance.obj_id, mesh)
         T = np.asarray(instance.T_cam_obj, np.float64)
         center_z_m = self._center_z_m(instance)
         if center_z_m + mesh.diameter_m <= near_m:
@@ -320,23 +353,31 @@ class Rasteriser:
         else:
             self._context.disable(moderngl.CULL_FACE)
         clip = _clip_from_cam(K, width_px, height_px, near_m, far_m=100.0)
-        program = self._program
+        program = self._program if rgb else self._depth_program
         program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
         program["cam_from_obj"].write(T.T.astype("f4").tobytes())
+        if not rgb:
+            depth_only.render(moderngl.TRIANGLES)
+            return
         program["tint"].value = instance.tint
         program["instance"].value = float(label)
         texture = self._textures.get(instance.obj_id)
         program["textured"].value = texture is not None
         (texture or self._blank).use(0)
-        array.render(moderngl.TRIANGLES)
+        coloured.render(moderngl.TRIANGLES)
 
-    def _read(self, target: moderngl.Framebuffer, size: tuple[int, int], attachment: int) -> Array:
+    def _read_rgb(self, target: moderngl.Framebuffer, size: tuple[int, int]) -> UInt8[Array, "h w 3"]:
         width, height = size
-        if attachment == 0:
-            data = target.read(viewport=(0, 0, width, height), components=3, attachment=0, alignment=1)
-            return np.frombuffer(data, np.uint8).reshape(height, width, 3)
-        data = target.read(viewport=(0, 0, width, height), components=2, attachment=1, dtype="f4", alignment=1)
-        return np.frombuffer(data, np.float32).reshape(height, width, 2)
+        data = target.read(viewport=(0, 0, width, height), components=3, attachment=0, alignment=1)
+        return np.frombuffer(data, np.uint8).reshape(height, width, 3)
+
+    def _read_floats(
+        self, target: moderngl.Framebuffer, size: tuple[int, int], attachment: int, components: int
+    ) -> Float[Array, "h w c"]:
+        width, height = size
+        viewport = (0, 0, width, height)
+        data = target.read(viewport=viewport, components=components, attachment=attachment, dtype="f4", alignment=1)
+        return np.frombuffer(data, np.float32).reshape(height, width, components)
 
     def _center_z_m(self, instance: Instance) -> float:
         """Camera z of the box centre, as the origin may lie metres off the mesh. No vertex is a diameter from it."""
@@ -353,15 +394,20 @@ class Rasteriser:
             raise RenderError(f"object {obj_id} has no mesh here; there are meshes for {sorted(self._meshes)}")
         return self._meshes[obj_id]
 
-    def _array(self, obj_id: int, mesh: Mesh) -> moderngl.VertexArray:
+    def _array(self, obj_id: int, mesh: Mesh) -> tuple[moderngl.VertexArray, moderngl.VertexArray]:
+        """The mesh as the two programs take it: with colours, and positions alone."""
         if obj_id in self._arrays:
             return self._arrays[obj_id]
         textured = mesh.uv is not None and mesh.texture_rgb is not None
         uv = np.zeros((len(mesh.vertices_m), 2)) if mesh.uv is None else mesh.uv
         vertices = np.hstack([mesh.vertices_m, mesh.normals, mesh.colours / 255.0, uv]).astype("f4")
         layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
+        positions = (self._context.buffer(np.ascontiguousarray(vertices[:, :3]).tobytes()), "3f", "position")
         index = self._context.buffer(mesh.faces.astype("i4").tobytes())
-        self._arrays[obj_id] = self._context.vertex_array(self._program, [layout], index)
+        self._arrays[obj_id] = (
+            self._context.vertex_array(self._program, [layout], index),
+            self._context.vertex_array(self._depth_program, [positions], index),
+        )
         if textured:
             assert mesh.texture_rgb is not None
             height, width = mesh.texture_rgb.shape[:2]
@@ -373,10 +419,9 @@ class Rasteriser:
         return self._arrays[obj_id]
 
     def _release(self, obj_id: int) -> None:
-        for store in (self._arrays, self._textures):
-            held = store.pop(obj_id, None)
-            if held is not None:
-                held.release()
+        texture = self._textures.pop(obj_id, None)
+        for held in (*self._arrays.pop(obj_id, ()), *([] if texture is None else [texture])):
+            held.release()
 
     def _free(self, target: moderngl.Framebuffer) -> None:
         for attachment in (*target.color_attachments, target.depth_attachment):

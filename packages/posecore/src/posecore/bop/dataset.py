@@ -49,6 +49,7 @@ class BopDataset:
             raise DatasetError(f"{self.root}: no such folder; give the folder of a BOP dataset")
         self.split = split or choose_split(self.root)
         self.split_path = self.root / self.split
+        self.sensor = sensor
         self._source, self.sensors = open_source(self.split_path, sensor)
         self.scene_ids: list[int] = self._source.scene_ids
         self._scenes = set(self.scene_ids)
