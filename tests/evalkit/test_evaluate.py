@@ -2,10 +2,12 @@
 
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from evalkit import silhouette
 from evalkit.curves import by_level
@@ -46,6 +48,51 @@ def test_truth_scores_perfectly(dataset, perfect, kind):
     total = scores(rows)
     assert [total[key] for key in ("vss_mean", "add_recall_0.1d", "adi_auc_100mm", "ar_mssd", "ar_mspd")] == [1.0] * 5
     assert (total["5cm5deg"], total["proj_5px"], total["diverged"], total["missing"]) == (1.0, 1.0, 0.0, 0)
+
+
+def test_values_do_not_depend_on_workers_or_blocks(dataset, perfect, monkeypatch):
+    rng = np.random.default_rng(1)
+    moved = [replace(e, T_cam_obj=se3.perturb(e.T_cam_obj, 0.2, 0.02, rng)) for e in perfect for _ in range(7)]
+    pairs = pair_up(dataset, in_memory(perfect[:5])).pairs
+    truths = {(pair.scene_id, pair.im_id, pair.truth.obj_id): pair for pair in pairs}
+    pairs += [replace(truths[e.scene_id, e.im_id, e.obj_id], estimate=e) for e in rng.permutation(moved)]
+    done = []
+    with Evaluator(dataset) as one, Evaluator(dataset, workers=2) as two:
+        whole = one.evaluate(pairs, done.append)
+        parallel = two.evaluate(pairs, done.append)
+        monkeypatch.setattr(sys.modules["evalkit.evaluate"], "BLOCK", 4)
+        monkeypatch.setattr("evalkit.scorer.KEPT_BYTES", 0)
+        blocks = one.evaluate(pairs, done.append)
+        none = two.evaluate([])
+    pd.testing.assert_frame_equal(parallel, whole, check_exact=True)
+    pd.testing.assert_frame_equal(blocks, whole, check_exact=True)
+    assert whole.found.tolist() == [True] * 5 + [False] + [True] * 42
+    assert sum(done) == 3 * len(pairs)
+    assert len(none) == 0
+
+
+def test_a_fault_in_a_worker_is_the_error_of_one_process(dataset_path, tmp_path, perfect):
+    root = tmp_path / "toys"
+    shutil.copytree(dataset_path, root)
+    dataset = BopDataset(root)
+    pairs = pair_up(dataset, in_memory(perfect)).pairs
+    shutil.rmtree(root / "test/000020/depth")
+    with Evaluator(dataset, "visible", workers=2) as evaluator, pytest.raises(DatasetError, match="image 1 has no dep"):
+        evaluator.evaluate(pairs)
+
+
+def test_known_errors_are_not_computed_again(dataset, perfect, monkeypatch):
+    pairs = pair_up(dataset, in_memory(perfect)).pairs
+    again = [replace(perfect[0], score=0.1), *perfect]
+    with Evaluator(dataset) as evaluator:
+        table = evaluator.evaluate(pairs)
+        anew = evaluator.all_errors(again)
+        scored = []
+        plain = evaluator._scorer.score
+        monkeypatch.setattr(evaluator._scorer, "score", lambda block: scored.extend(block) or plain(block))
+        reused = evaluator.all_errors(again, known=(pairs, table))
+    pd.testing.assert_frame_equal(reused.errors, anew.errors, check_exact=True)
+    assert [pair.estimate.score for pair in scored] == [0.1]
 
 
 def test_symmetric_turns_score_as_the_truth(dataset, perfect):
