@@ -210,7 +210,7 @@ def test_visible_silhouettes_of_a_half_hidden_plate(plates):
 
 
 def test_vsd_of_a_plate_in_depth(plates):
-    """A centimetre farther is within delta, so the same half is seen, and all of it is wrong or right at a tolerance."""
+    """A centimetre farther is within delta, so the same half is seen, all of it wrong or right at a tolerance."""
     rows = plate_rows(plates, [at_pixels(), at_pixels(z_m=1.01)])
     diameter_m = np.sqrt(2) * 0.1
     names = [name for name in rows.columns if name.startswith("vsd_")]
