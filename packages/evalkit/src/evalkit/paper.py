@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from posecore.bop import BopDataset
 
 from evalkit.curves import by_level, by_level_and_object, level_object_tables, level_tables
 from evalkit.evaluate import Evaluator, VssKind
 from evalkit.files import load_result_files
 from evalkit.formats import Table
-from evalkit.pairing import pair_up
 from evalkit.perturb import departures
 from evalkit.refinement import (
     By,
@@ -21,9 +19,7 @@ from evalkit.refinement import (
     methods_of,
     score_by_group_table,
 )
-from evalkit.scored import Scored
-
-NO_POSE = np.full((4, 4), np.nan)
+from evalkit.scored import Scored, score_file
 
 
 def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full") -> list[Scored]:
@@ -32,22 +28,8 @@ def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
     """
-    scored = []
     with Evaluator(dataset, vss) as evaluator:
-        for file in load_result_files(paths, dataset):
-            pairing = pair_up(dataset, file)
-            estimated = [NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]
-            true = [pair.truth.T_cam_obj for pair in pairing.pairs]
-            scored.append(
-                Scored(
-                    file=file,
-                    table=evaluator.evaluate(pairing.pairs),
-                    T_est=np.array(estimated, np.float64).reshape(-1, 4, 4),
-                    T_gt=np.array(true, np.float64).reshape(-1, 4, 4),
-                    ignored=pairing.ignored,
-                )
-            )
-    return scored
+        return [score_file(evaluator, file) for file in load_result_files(paths, dataset)]
 
 
 def paper_tables(scored: Sequence[Scored], *, by: By = "object", resamples: int = 0, seed: int = 0) -> list[Table]:

@@ -3,12 +3,11 @@
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from posecore.bop import BopDataset
 from posecore.errors import ConfigError
 from posecore.files import write_atomic
@@ -17,13 +16,10 @@ from evalkit.evaluate import Evaluator, VssKind
 from evalkit.files import load_result_files
 from evalkit.formats import write_tables
 from evalkit.page import report_page
-from evalkit.pairing import Pair, Pairing, pair_up
-from evalkit.scored import Scored
+from evalkit.scored import Scored, score_file
 from evalkit.summary import summarise
 from evalkit.summary_tables import report_tables
 
-Array = np.ndarray
-NO_POSE = np.full((4, 4), np.nan)
 Start = Callable[[str, int], Callable[[int], None]]
 """Announces a result file and its number of poses; returns what is called as they are done."""
 
@@ -64,18 +60,8 @@ def write_report(
     if not results:
         raise ConfigError("no result files: name them with --results FILE.csv")
     files = load_result_files(results, dataset)
-    pairings: list[Pairing] = [pair_up(dataset, file) for file in files]
     with Evaluator(dataset, vss) as evaluator:
-        scored = [
-            Scored(
-                file=file,
-                table=evaluator.evaluate(pairing.pairs, start(file.name, len(pairing.pairs))),
-                T_est=_poses(pairing.pairs, lambda pair: NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj),
-                T_gt=_poses(pairing.pairs, lambda pair: pair.truth.T_cam_obj),
-                ignored=pairing.ignored,
-            )
-            for file, pairing in zip(files, pairings, strict=True)
-        ]
+        scored = [score_file(evaluator, file, partial(start, file.name)) for file in files]
         summary = summarise(dataset, scored, vss)
         page = report_page(evaluator, scored, summary, worst)
     written = Report(
@@ -91,10 +77,6 @@ def write_report(
         write_tables(file, report_tables(summary))
     write_atomic(written.page, page.encode())
     return written
-
-
-def _poses(pairs: Sequence[Pair], pose_of: Callable[[Pair], Array]) -> Float[Array, "n 4 4"]:
-    return np.array([pose_of(pair) for pair in pairs], np.float64).reshape(-1, 4, 4)
 
 
 def estimates_csv(scored: Sequence[Scored]) -> str:

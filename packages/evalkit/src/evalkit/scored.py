@@ -1,14 +1,20 @@
 """A result file with the errors of its poses."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from evalkit.evaluate import Evaluator, Progress
 from evalkit.files import ResultFile
+from evalkit.pairing import pair_up
+from evalkit.scores import bop24_precision, with_bop19
 
 Array = np.ndarray
+NO_POSE = np.full((4, 4), np.nan)
 CaseKey = tuple[int, int, int, float, float, int]
 """Scene, image, position of the truth, start angle and translation (-1 for none), and how many alike came before."""
 
@@ -23,6 +29,7 @@ class Scored:
         T_est: (n, 4, 4) estimates `T_cam_obj`, metres, NaN where missing.
         T_gt: (n, 4, 4) true poses.
         ignored: lines that belong to no expected pose.
+        precision: BOP24's average precision of all lines, see `scores.bop24_precision`; empty for perturbed starts.
     """
 
     file: ResultFile
@@ -30,6 +37,7 @@ class Scored:
     T_est: Float[Array, "n 4 4"]
     T_gt: Float[Array, "n 4 4"]
     ignored: int
+    precision: dict[str, Any] = field(default_factory=dict)
 
     def cases(self) -> dict[CaseKey, int]:
         """Row of each pose under a key that other result files share."""
@@ -39,3 +47,35 @@ class Scored:
         nth = key.groupby(list(key.columns), sort=False).cumcount() + 1
         keys = zip(*(key[name].tolist() for name in key), nth.tolist(), strict=True)
         return {values: row for row, values in enumerate(keys)}
+
+
+def score_file(
+    evaluator: Evaluator, file: ResultFile, start: Callable[[int], Progress] = lambda total: lambda done: None
+) -> Scored:
+    """Errors of a result file's poses, with BOP's own matching beside them (but for perturbed starts).
+
+    Args:
+        evaluator: of the dataset.
+        file: that was read.
+        start: is told how many poses there are, and returns what is called with the number done since the last call.
+
+    Raises:
+        PoseError: the file's sidecar or the dataset is not usable; the message names it.
+    """
+    pairing = pair_up(evaluator.dataset, file)
+    table, precision = evaluator.evaluate(pairing.pairs, start(len(pairing.pairs))), {}
+    if "perturbation" not in file.sidecar:
+        everything = evaluator.all_errors(file.estimates, known=(pairing.pairs, table))
+        table, precision = with_bop19(table, everything), bop24_precision(everything)
+    return Scored(
+        file=file,
+        table=table,
+        T_est=_stacked([NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]),
+        T_gt=_stacked([pair.truth.T_cam_obj for pair in pairing.pairs]),
+        ignored=pairing.ignored,
+        precision=precision,
+    )
+
+
+def _stacked(poses: Sequence[Array]) -> Float[Array, "n 4 4"]:
+    return np.array(poses, np.float64).reshape(-1, 4, 4)

@@ -65,8 +65,11 @@ def _file_summary(
         "is_start": item.file.is_start,
         "sidecar": sidecar,
         "ignored_lines": item.ignored,
-        "total": scores(item.table),
-        "by_object": {str(obj_id): values for obj_id, values in by_object(item.table).items()},
+        "total": scores(item.table) | {name: value for name, value in item.precision.items() if name != "by_object"},
+        "by_object": {
+            str(obj_id): values | item.precision.get("by_object", {}).get(obj_id, {})
+            for obj_id, values in by_object(item.table).items()
+        },
         "by_level": by_level(item.table),
         "bins": bins_of(item.table, distance_edges_m),
         "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, symmetries)).to_dict("index"),

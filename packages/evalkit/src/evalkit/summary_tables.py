@@ -37,6 +37,16 @@ AREA_COLUMNS = (
     _column("BOP average recall", "MSSD", "ar_mssd", "", 3, "higher"),
     _column("BOP average recall", "MSPD", "ar_mspd", "", 3, "higher"),
 )
+PRECISION_COLUMNS = (
+    _column("BOP24 average precision", "AP", "ap", "", 3, "higher"),
+    _column("BOP24 average precision", "MSSD", "ap_mssd", "", 3, "higher"),
+    _column("BOP24 average precision", "MSPD", "ap_mspd", "", 3, "higher"),
+    _column("BOP25", "AP MSSD mm", "ap_mssd_mm", "", 3, "higher"),
+    _column("counted", "estimates", "estimates", "", 0),
+    _column("counted", "instances", "instances", "", 0),
+    _column("left out", "outscored", "outscored", "", 0),
+    _column("left out", "absent object", "absent", "", 0),
+)
 
 
 def _mean_and_median(group: str, key: str, unit: str, digits: int = 2) -> tuple[Column, Column]:
@@ -63,9 +73,11 @@ SURFACE_COLUMNS = (
     _column("run time", "an image", "time_s_per_image", "s", 3, "lower"),
 )
 ERRORS_NOTE = "Errors are over the estimates that were found."
+PRECISION_NOTE = "Over all lines of the file with their scores, and all instances; a total is the mean over objects."
 SCORE_TABLES = (
     ("Scores", "scores", SCORE_COLUMNS, ""),
     ("Areas under recall curves", "areas", AREA_COLUMNS, ""),
+    ("6D detection", "precision", PRECISION_COLUMNS, PRECISION_NOTE),
     ("Rotation and translation errors", "pose-errors", POSE_COLUMNS, ERRORS_NOTE),
     ("Distances of origins, surfaces and projections", "surface-errors", SURFACE_COLUMNS, ERRORS_NOTE),
 )
@@ -130,10 +142,11 @@ def total_tables(summary: Mapping[str, Any]) -> list[Table]:
     first = Column(key="name", heading="result file")
     resampled = ", ".join(dict.fromkeys(_resampled(file["intervals"]["total"]) for file in summary["files"]))
     interval_note = _interval_note(resampled)
-    return [
+    tables = [
         _table(title, name, first, rows, columns, note=note if place else interval_note)
         for place, (title, name, columns, note) in enumerate(SCORE_TABLES)
     ]
+    return [table for table in tables if len(table.columns) > 1]
 
 
 def object_tables(summary: Mapping[str, Any]) -> dict[str, list[Table]]:
@@ -147,10 +160,11 @@ def object_tables(summary: Mapping[str, Any]) -> dict[str, list[Table]]:
         ]
         rows.append(({"name": "total"}, file["total"], intervals["total"]["intervals"]))
         first = Column(key="name", heading="object")
-        tables[name] = [
+        described = [
             _table(f"{title} of {name} by object", f"{slug}-objects-{place}", first, rows, columns, True, note)
             for title, slug, columns, note in SCORE_TABLES
         ]
+        tables[name] = [table for table in described if len(table.columns) > 1]
     return tables
 
 

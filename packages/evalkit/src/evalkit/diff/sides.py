@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
@@ -14,11 +13,9 @@ from posecore.files import sha256_file
 
 from evalkit.evaluate import Evaluator, VssKind
 from evalkit.files import dataset_of, load_result_files
-from evalkit.pairing import pair_up
-from evalkit.scored import Scored
+from evalkit.scored import Scored, score_file
 from evalkit.table import COLUMNS
 
-NO_POSE = np.full((4, 4), np.nan)
 NAMES_COLUMN = "results"
 """Of a table of errors: which result file a line is of."""
 
@@ -85,23 +82,10 @@ def open_sides(
             raise ConfigError(f"{path}: is a result file, which holds no '{name}'; leave --result-a and --result-b out")
     opened = BopDataset(dataset or dataset_of(to_score, Path()), split)
     with Evaluator(opened, vss) as evaluator:
-        scored = {item.file.path: item for item in _scored(evaluator, to_score)}
+        scored = {file.path: score_file(evaluator, file) for file in load_result_files(to_score, opened)}
         both = [side or _side_of(scored[path]) for path, side in zip(paths, tables, strict=True)]
         a, b = _renamed(both)
         yield Sides(a=a, b=b, evaluator=evaluator)
-
-
-def _scored(evaluator: Evaluator, paths: Sequence[Path]) -> Iterator[Scored]:
-    for file in load_result_files(paths, evaluator.dataset):
-        pairing = pair_up(evaluator.dataset, file)
-        estimated = [NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]
-        yield Scored(
-            file=file,
-            table=evaluator.evaluate(pairing.pairs),
-            T_est=np.array(estimated, np.float64).reshape(-1, 4, 4),
-            T_gt=np.array([pair.truth.T_cam_obj for pair in pairing.pairs], np.float64).reshape(-1, 4, 4),
-            ignored=pairing.ignored,
-        )
 
 
 def _side_of(scored: Scored) -> Side:
