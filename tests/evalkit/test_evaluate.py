@@ -17,7 +17,7 @@ from evalkit.metrics import vss
 from evalkit.pairing import Pair, pair_up
 from evalkit.scored import Scored
 from evalkit.scores import by_object, scores
-from evalkit.silhouette import Patch, View
+from evalkit.silhouette import Patch
 from evalkit.summary import start_of
 from evalkit.table import column, table_of
 from posecore import se3
@@ -193,8 +193,7 @@ def test_crops_are_the_full_frame(dataset, perfect):
     size = (CAMERA.width_px, CAMERA.height_px)
     with Evaluator(dataset) as evaluator:
         evaluator.mesh(TUG)
-        views = [View(camera=CAMERA, T_cam_obj=T) for T in poses]
-        patches = silhouette.render_patches(evaluator.rasteriser, TUG, mesh.vertices_m, views)
+        patches = [silhouette.render_patch(evaluator.rasteriser, TUG, mesh.vertices_m, CAMERA, T) for T in poses]
         frames = evaluator.rasteriser.render(TUG, CAMERA.K, np.stack(poses), *size, rgb=False).mask
     for patch, frame in zip(patches, frames, strict=True):
         rows, columns = patch.depth_m.shape

@@ -22,13 +22,13 @@ from evalkit.refinement import (
 from evalkit.scored import Scored, score_file
 
 
-def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full") -> list[Scored]:
-    """Evaluate result files, starts first.
+def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full", *, workers: int = 1) -> list[Scored]:
+    """Evaluate result files, starts first, in so many processes.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
     """
-    with Evaluator(dataset, vss) as evaluator:
+    with Evaluator(dataset, vss, workers=workers) as evaluator:
         return [score_file(evaluator, file) for file in load_result_files(paths, dataset)]
 
 

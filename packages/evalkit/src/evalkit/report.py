@@ -42,6 +42,7 @@ def write_report(
     *,
     vss: VssKind = "full",
     worst: int = 12,
+    workers: int = 1,
     start: Start = lambda name, total: lambda done: None,
 ) -> Report:
     """Evaluate result files; write `index.html`, `tables.md`, `tables.tex`, `estimates.csv`, `summary.json` into `out`.
@@ -52,6 +53,7 @@ def write_report(
         out: folder, made where it does not exist.
         vss: whole silhouettes or visible parts.
         worst: number of worst cases to show as pictures.
+        workers: number of processes that score poses.
         start: progress, see `Start`.
 
     Raises:
@@ -60,7 +62,7 @@ def write_report(
     if not results:
         raise ConfigError("no result files: name them with --results FILE.csv")
     files = load_result_files(results, dataset)
-    with Evaluator(dataset, vss) as evaluator:
+    with Evaluator(dataset, vss, workers=workers) as evaluator:
         scored = [score_file(evaluator, file, partial(start, file.name)) for file in files]
         summary = summarise(dataset, scored, vss)
         page = report_page(evaluator, scored, summary, worst)

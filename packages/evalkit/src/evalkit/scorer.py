@@ -17,7 +17,7 @@ from evalkit import metrics, silhouette
 from evalkit.pairing import Pair
 from evalkit.pose_errors import ERRORS, Model, pose_errors
 from evalkit.scores.definitions import VSD_COLUMNS, VSD_TAUS
-from evalkit.silhouette import Patch, View
+from evalkit.silhouette import Patch
 from evalkit.table import table_of
 
 Array = np.ndarray
@@ -164,11 +164,12 @@ class Scorer:
             size -= self._truths.popitem(last=False)[1].depth_m.nbytes
 
     def _render(self, obj_id: int, pairs: Sequence[Pair], T_cam_obj: Float[Array, "b 4 4"]) -> list[Patch]:
-        views = [
-            View(camera=self.camera(pair.scene_id, pair.im_id), T_cam_obj=pose)
-            for pair, pose in zip(pairs, T_cam_obj, strict=True)
+        hull_m = self.model(obj_id).hull_m
+        cameras = [self.camera(pair.scene_id, pair.im_id) for pair in pairs]
+        return [
+            silhouette.render_patch(self.rasteriser, obj_id, hull_m, camera, pose)
+            for camera, pose in zip(cameras, T_cam_obj, strict=True)
         ]
-        return silhouette.render_patches(self.rasteriser, obj_id, self.model(obj_id).hull_m, views)
 
     def _compare(self, pair: Pair, patch: Patch) -> tuple[float, Float[Array, " t"]]:
         true, K = self._truths[_truth_key(pair)], self.camera(pair.scene_id, pair.im_id).K

@@ -1,7 +1,5 @@
-"""Rendered silhouettes, kept as small patches of the image, many poses to one read-back."""
+"""Rendered silhouettes, kept as small patches of the image."""
 
-from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +11,8 @@ from posecore.window import silhouette_box
 from evalkit import metrics
 
 Array = np.ndarray
-TILE_SIDES_PX = (32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
-BATCH_PIXELS = 4_000_000
+TILE_SIDES_PX = (64, 128, 192, 256, 384, 512, 1024)
+"""Sides that tiles are rounded up to, as the renderer keeps a few sizes at hand."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,53 +30,34 @@ class Patch:
     y0_px: int
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class View:
-    """A pose to render and the camera to see it with."""
+def render_patch(
+    rasteriser: Rasteriser, obj_id: int, outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]
+) -> Patch:
+    """Render one pose; only what lies inside the image is kept.
 
-    camera: Camera
-    T_cam_obj: Float[Array, "4 4"]
-
-
-def render_patches(
-    rasteriser: Rasteriser, obj_id: int, outline_m: Float[Array, "n 3"], views: Sequence[View]
-) -> list[Patch]:
-    """Render one object at many poses; only what lies inside each image is kept.
-
-    Pixels are those of a full-frame render: the crop moves the principal point by whole pixels.
+    Pixels are those of a full-frame render: the crop moves the principal point by whole pixels. Poses are rendered one
+    at a time, as side by side in one framebuffer a pixel on an edge may depend on the place in it.
 
     Args:
         rasteriser: has the object's mesh.
         obj_id: which mesh.
         outline_m: points that the mesh lies between: its vertices, or those of its convex hull, which are fewer.
-        views: poses and cameras.
+        camera: of the image.
+        T_cam_obj: pose, metres.
     """
-    tiles = [_tile(outline_m, view) for view in views]
-    by_side: dict[int, list[int]] = defaultdict(list)
-    for index, (_, _, side) in enumerate(tiles):
-        by_side[side].append(index)
-    patches: list[Patch | None] = [None] * len(views)
-    for side, indices in by_side.items():
-        if side == 0:
-            for index in indices:
-                patches[index] = Patch(depth_m=np.zeros((0, 0), np.float32), x0_px=0, y0_px=0)
-            continue
-        batch = max(1, BATCH_PIXELS // side**2)
-        for start in range(0, len(indices), batch):
-            part = indices[start : start + batch]
-            K = np.stack([views[index].camera.K for index in part])
-            K[:, :2, 2] -= np.array([tiles[index][:2] for index in part])
-            poses = np.stack([views[index].T_cam_obj for index in part])
-            depth_m = rasteriser.render(obj_id, K, poses, side, side, rgb=False).depth_m
-            for index, layer in zip(part, depth_m, strict=True):
-                patches[index] = _trim(layer, tiles[index][0], tiles[index][1], views[index].camera)
-    return [patch for patch in patches if patch is not None]
+    x0_px, y0_px, side_px = _tile(outline_m, camera, T_cam_obj)
+    if side_px == 0:
+        return Patch(depth_m=np.zeros((0, 0), np.float32), x0_px=0, y0_px=0)
+    K = camera.K.copy()
+    K[:2, 2] -= (x0_px, y0_px)
+    depth_m = rasteriser.render(obj_id, K, T_cam_obj[None], side_px, side_px, rgb=False).depth_m[0]
+    return _trim(depth_m, x0_px, y0_px, camera)
 
 
-def _tile(outline_m: Float[Array, "n 3"], view: View) -> tuple[int, int, int]:
+def _tile(outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]) -> tuple[int, int, int]:
     """Left, top and side of a square that covers the object's part of the image; side 0 where there is none."""
-    width, height = view.camera.width_px, view.camera.height_px
-    left, top, right, bottom = silhouette_box(outline_m, view.camera.K, view.T_cam_obj)
+    width, height = camera.width_px, camera.height_px
+    left, top, right, bottom = silhouette_box(outline_m, camera.K, T_cam_obj)
     x0, y0 = int(max(np.floor(left) - 1, 0)) if left > 0 else 0, int(max(np.floor(top) - 1, 0)) if top > 0 else 0
     x1 = int(min(np.ceil(right) + 1, width)) if right < width else width
     y1 = int(min(np.ceil(bottom) + 1, height)) if bottom < height else height

@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, workers_option
 
 RESULTS = click.Path(path_type=Path, dir_okay=False)
 
@@ -16,6 +16,7 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
 @click.option("--dataset", type=FOLDER, help="BOP dataset folder. Default: the one the files' sidecars name.")
 @split_option
 @vss_option
+@workers_option
 @click.option(
     "--limit",
     type=click.FloatRange(0, min_open=True),
@@ -41,6 +42,7 @@ def diff(
     dataset: Path | None,
     split: str | None,
     vss: Literal["full", "visible"],
+    workers: int,
     limit: float,
     rules: tuple[str, ...],
     result_a: str | None,
@@ -81,7 +83,7 @@ def diff(
 
     parsed = [parse_rule(rule) for rule in rules]
     named = (result_a, result_b)
-    with open_sides((a, b), results=named, dataset=dataset, split=split, vss=vss) as sides:
+    with open_sides((a, b), results=named, dataset=dataset, split=split, vss=vss, workers=workers) as sides:
         difference = differences(sides, limit_diameters=limit, resamples=resamples, seed=seed)
         verdicts = judge(parsed, difference)
         click.echo(text(difference, listed))

@@ -31,3 +31,10 @@ vss_option = click.option(
     show_default=True,
     help="Whole silhouettes, or their visible parts (needs depth images).",
 )
+workers_option = click.option(
+    "--workers",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Processes that score poses; the numbers do not depend on it.",
+)

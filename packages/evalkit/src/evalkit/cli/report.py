@@ -8,7 +8,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from evalkit.cli.options import FOLDER, split_option, vss_option
+from evalkit.cli.options import FOLDER, split_option, vss_option, workers_option
 
 
 @click.command()
@@ -19,6 +19,7 @@ from evalkit.cli.options import FOLDER, split_option, vss_option
 @click.option("--out", type=FOLDER, default=Path("report"), show_default=True, help="Folder for the report.")
 @split_option
 @vss_option
+@workers_option
 @click.option("--worst", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of worst cases.")
 def report(
     dataset: Path | None,
@@ -26,6 +27,7 @@ def report(
     out: Path,
     split: str | None,
     vss: Literal["full", "visible"],
+    workers: int,
     worst: int,
 ) -> None:
     """Write a report: one HTML page, its tables for papers, a CSV line for each pose, a JSON summary.
@@ -53,7 +55,7 @@ def report(
             task = progress.add_task(name, total=total)
             return lambda done: progress.advance(task, done)
 
-        written = write_report(opened, paths, out, vss=vss, worst=worst, start=start)
+        written = write_report(opened, paths, out, vss=vss, worst=worst, workers=workers, start=start)
     for item in written.summary["against_start"]:
         click.echo(item["words"])
     for file in written.summary["files"]:

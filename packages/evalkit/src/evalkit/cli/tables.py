@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, workers_option
 
 
 @click.command()
@@ -22,6 +22,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option
     help="What has a row of its own and is counted once in totals.",
 )
 @vss_option
+@workers_option
 @click.option(
     "--resamples", type=click.IntRange(0), default=0, show_default=True, help="For 95 % intervals; 1000 are enough."
 )
@@ -32,6 +33,7 @@ def tables(
     split: str | None,
     by: Literal["object", "scene"],
     vss: Literal["full", "visible"],
+    workers: int,
     resamples: int,
     out: tuple[Path, ...],
 ) -> None:
@@ -56,7 +58,7 @@ def tables(
     here = Path()
     paths = list(results) or find_result_files(here)
     opened = BopDataset(dataset or dataset_of(paths, here), split)
-    found = paper_tables(score_files(opened, paths, vss), by=by, resamples=resamples)
+    found = paper_tables(score_files(opened, paths, vss, workers=workers), by=by, resamples=resamples)
     click.echo(text_of(found, ".md"), nl=False)
     for path in out:
         for written in write_tables(path, found):

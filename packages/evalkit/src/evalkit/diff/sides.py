@@ -56,6 +56,7 @@ def open_sides(
     dataset: Path | None = None,
     split: str | None = None,
     vss: VssKind = "full",
+    workers: int = 1,
 ) -> Iterator[Sides]:
     """Read two files, and evaluate those that are result files.
 
@@ -65,6 +66,7 @@ def open_sides(
         dataset: folder; by default the one that the result files' sidecars name. Tables of errors need none.
         split: of the dataset.
         vss: whole silhouettes or visible parts.
+        workers: number of processes that score poses.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
@@ -81,7 +83,7 @@ def open_sides(
         if side is None and name is not None:
             raise ConfigError(f"{path}: is a result file, which holds no '{name}'; leave --result-a and --result-b out")
     opened = BopDataset(dataset or dataset_of(to_score, Path()), split)
-    with Evaluator(opened, vss) as evaluator:
+    with Evaluator(opened, vss, workers=workers) as evaluator:
         scored = {file.path: score_file(evaluator, file) for file in load_result_files(to_score, opened)}
         both = [side or _side_of(scored[path]) for path, side in zip(paths, tables, strict=True)]
         a, b = _renamed(both)
