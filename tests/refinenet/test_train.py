@@ -90,6 +90,23 @@ def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_pat
         checkpoint.load(out / "last.safetensors", "paper")
 
 
+def test_a_run_begins_with_the_weights_of_another(run, dataset, tmp_path):
+    first = checkpoint.load(run[0] / "best.safetensors")
+    config = small(f"init={first.path}", "optimiser.lr=1e-12", "optimiser.weight_decay=0", "steps=1")
+    train(config, str(dataset), tmp_path / "second")
+    second = checkpoint.load(tmp_path / "second/last.safetensors")
+    assert second.provenance.step == 1
+    assert second.provenance.config.init == str(first.path)
+    learned = dict(first.network().named_parameters())
+    for name, weights in learned.items():
+        torch.testing.assert_close(second.tensors[name], weights, rtol=0, atol=1e-6)
+    wider = small(f"init={first.path}", "network.hidden=48")
+    with pytest.raises(CheckpointError, match=r"best.safetensors: weights of another network \(size mismatch.*\); begin"):
+        train(wider, str(dataset), tmp_path / "third")
+    with pytest.raises(CheckpointError, match="none.safetensors: no such checkpoint"):
+        train(small("init=none.safetensors"), str(dataset), tmp_path / "fourth")
+
+
 def test_metrics_that_cannot_be_written_name_their_file(tmp_path):
     with MetricLog(tmp_path, 0) as log:
         log.write(1, {"loss_px": 1.0})

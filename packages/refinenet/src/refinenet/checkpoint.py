@@ -63,6 +63,21 @@ class Checkpoint:
     path: Path
     sha256: str
 
+    def give_weights(self, network: nn.Module) -> None:
+        """Load these weights into another run's network.
+
+        Raises:
+            CheckpointError: It has other layers.
+        """
+        try:
+            network.load_state_dict(self.tensors)
+        except RuntimeError as error:
+            detail = str(error).splitlines()[-1].strip()[:200]
+            raise CheckpointError(
+                f"{self.path}: weights of another network ({detail}); begin with a checkpoint of preset "
+                f"{self.provenance.config.preset} trained with the same `network` settings as this run"
+            ) from error
+
     def network(self) -> nn.Module:
         """The network with these weights, in evaluation mode.
 

@@ -313,6 +313,7 @@ class TrainConfig:
         batch: pairs in a batch, on each rank; a step takes `optimiser.accumulate` of them.
         steps: steps of the run; the cosine schedule ends there.
         seed: of weights, order, hypotheses and augmentation.
+        init: checkpoint whose weights the run begins with, of a network of the same settings; empty begins at random.
         threads: torch threads; 0 leaves torch's own choice.
         precision: of the convolutions in training; `auto` is bfloat16 on GPUs and on processors that compute in it,
             float32 elsewhere. Poses, losses and weights are float32 always.
@@ -335,6 +336,7 @@ class TrainConfig:
     batch: int = 16
     steps: int = 100_000
     seed: int = 0
+    init: str = ""
     threads: int = 0
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"

@@ -112,6 +112,8 @@ class Trainer:
         if last is None and isinstance(self.network, PaperNet) and config.network.backbone.pretrained:
             stem = config.network.backbone
             backbone.load_pretrained(self.network.stem, stem.name, stem.weights)
+        if last is None and config.init:
+            checkpoint.load(Path(config.init)).give_weights(self.network)
         decay = config.optimiser.ema_decay
         self._average = RunningAverage(self.network, decay) if decay else None
         if last is not None:

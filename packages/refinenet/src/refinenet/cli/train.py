@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 @click.option(
     "--backbone-weights", type=FILE, metavar="FILE", help="ImageNet weights of preset paper's stem (safetensors)."
 )
+@click.option("--init", type=FILE, metavar="FILE", help="Checkpoint whose weights the run begins with.")
 @click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
 @click.option("--resume", is_flag=True, help="Go on with the run in --out.")
 @click.option("--follow", is_flag=True, help="SHARDS is still being rendered: take new shards in between epochs.")
@@ -52,6 +53,7 @@ def train(
     file: Path | None,
     overrides: tuple[str, ...],
     backbone_weights: Path | None,
+    init: Path | None,
     out: Path | None,
     resume: bool,
     follow: bool,
@@ -74,6 +76,7 @@ def train(
     refinenet train shards/ --steps 4000
     refinenet train shards/ --preset paper --backbone-weights inception_v4.safetensors --out runs/benchvise
     refinenet train shards/ --set hypothesis.max_angle_deg=40 --set optimiser.lr=3e-4
+    refinenet train shards/ --init examples/checkpoints/tug_compact.safetensors --out runs/benchvise
     refinenet train shards/ --out runs/benchvise --resume
     refinenet train shards/ --follow --set optimiser.ema_decay=0.999 --set optimiser.accumulate=4
     torchrun --nproc-per-node 4 -m refinenet train s3://bucket/shards --preset paper
@@ -87,6 +90,7 @@ def train(
         "device": device, "loader.follow": follow or None, "loader.skip_bad_shards": skip_bad_shards or None,
         # quoted: a path may hold what YAML reads as a comment
         "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
+        "init": None if init is None else json.dumps(str(init)),
     }  # fmt: skip
     assigned = [*overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
     config = load_config(preset, assigned, file)
