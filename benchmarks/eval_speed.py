@@ -3,6 +3,11 @@
 Rounds of the same work, after one that loads and renders the ground truth: every error and VSS of every estimate; VSD
 at its ten tolerances beside them, of the images that have depth; and the pure functions one by one. Milliseconds an
 estimate of processor time, of one process: medians over the rounds, then one JSON line.
+
+    python benchmarks/eval_speed.py --dataset lmo --results start.csv --synthetic 200000 --workers 2
+
+scores so many estimates drawn near the truths instead, once, after a tenth as many: memory must not follow their
+number by more than the estimates and the table of errors take themselves.
 """
 
 import argparse
@@ -12,13 +17,16 @@ import resource
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from evalkit import metrics
 from evalkit.evaluate import Evaluator
 from evalkit.files import load_result_files
+from evalkit.nearest import NearestPoints
 from evalkit.pairing import Pair, pair_up
+from posecore import se3
 from posecore.bop import BopDataset, symmetry_transforms
 
 
@@ -28,14 +36,20 @@ def main() -> None:
     parser.add_argument("--dataset", type=Path, required=True, help="BOP dataset with ground truth")
     parser.add_argument("--results", type=Path, required=True, help="BOP result file")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--synthetic", type=int, default=0, metavar="N", help="score N estimates drawn near the truths")
+    parser.add_argument("--workers", type=int, default=1, help="processes, with --synthetic")
     arguments = parser.parse_args()
     dataset = BopDataset(arguments.dataset)
     (file,) = load_result_files([arguments.results], dataset)
     pairs = [pair for pair in pair_up(dataset, file).pairs if pair.estimate is not None]
+    if arguments.synthetic:
+        print(json.dumps(many(dataset, pairs, arguments.synthetic, arguments.workers)))
+        return
     deep = [pair for pair in pairs if dataset.depth_m(pair.scene_id, pair.im_id) is not None]
     with Evaluator(dataset, with_vsd=False) as errors, Evaluator(dataset) as both:
         work: dict[str, tuple[Callable[[], object], int]] = {"all": (lambda: errors.evaluate(pairs), len(pairs))}
         if deep:
+            both.evaluate(pairs)
             work["all_where_depth"] = (lambda: errors.evaluate(deep), len(deep))
             work["all_and_vsd_where_depth"] = (lambda: both.evaluate(deep), len(deep))
         work |= {name: (run, len(pairs)) for name, run in functions(dataset, errors, pairs).items()}
@@ -46,7 +60,7 @@ def main() -> None:
         "estimates_with_depth": len(deep),
         "cpus": os.cpu_count(),
         "load_average_1min": round(os.getloadavg()[0], 2),
-        "peak_memory_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3, 1),
+        "peak_memory_mb": peak_mb(resource.RUSAGE_SELF),
     }
     for name, value in times_ms.items():
         print(f"{name:24s} {value:8.3f} ms an estimate")
@@ -54,23 +68,63 @@ def main() -> None:
     print(json.dumps(result))
 
 
+def many(dataset: BopDataset, pairs: Sequence[Pair], count: int, workers: int) -> dict[str, object]:
+    """Score many estimates; what it took, and the peaks of memory of this process and of its largest worker."""
+    result: dict[str, object] = {
+        "benchmark": "eval_speed_synthetic",
+        "workers": workers,
+        "cpus": os.cpu_count(),
+        "load_average_1min": round(os.getloadavg()[0], 2),
+    }
+    with Evaluator(dataset, with_vsd=False, workers=workers) as evaluator:
+        for name, n in (("tenth", count // 10), ("all", count)):
+            drawn = near_truths(pairs, n)
+            began = time.monotonic()
+            table = evaluator.evaluate(drawn)
+            print(f"{len(table)} estimates in {time.monotonic() - began:.0f} s")
+            result |= {f"{name}_estimates": len(table), f"{name}_wall_s": round(time.monotonic() - began, 1)}
+            result[f"{name}_peak_memory_mb"] = peak_mb(resource.RUSAGE_SELF)
+    if workers > 1:
+        result["largest_worker_peak_memory_mb"] = peak_mb(resource.RUSAGE_CHILDREN)
+    return result
+
+
+def near_truths(pairs: Sequence[Pair], count: int) -> list[Pair]:
+    """Estimates up to 20 degrees and 3 cm from the truths, taken in turn."""
+    rng = np.random.default_rng(0)
+    drawn = []
+    for index in range(count):
+        pair = pairs[index % len(pairs)]
+        assert pair.estimate is not None
+        pose = se3.perturb(pair.truth.T_cam_obj, rng.uniform(0, 0.35), rng.uniform(0, 0.03), rng)
+        drawn.append(replace(pair, estimate=replace(pair.estimate, T_cam_obj=pose)))
+    return drawn
+
+
+def peak_mb(who: int) -> float:
+    """Peak resident memory."""
+    return round(resource.getrusage(who).ru_maxrss / 1e3, 1)
+
+
 def functions(dataset: BopDataset, evaluator: Evaluator, pairs: Sequence[Pair]) -> dict[str, Callable[[], object]]:
-    """Each error over all pairs by itself."""
-    symmetries = {obj_id: symmetry_transforms(info) for obj_id, info in dataset.models_info.items()}
+    """Each error over all pairs by itself, an object's together."""
+    by_object: dict[int, list[Pair]] = {}
+    for pair in pairs:
+        by_object.setdefault(pair.truth.obj_id, []).append(pair)
     cases = [
         (
-            pair.estimate.T_cam_obj,
-            pair.truth.T_cam_obj,
-            evaluator.mesh(pair.truth.obj_id).vertices_m,
-            symmetries[pair.truth.obj_id],
-            evaluator.camera(pair.scene_id, pair.im_id).K,
+            np.stack([pair.estimate.T_cam_obj for pair in found if pair.estimate is not None]),
+            np.stack([pair.truth.T_cam_obj for pair in found]),
+            evaluator.mesh(obj_id).vertices_m,
+            symmetry_transforms(dataset.models_info[obj_id]),
+            np.stack([evaluator.camera(pair.scene_id, pair.im_id).K for pair in found]),
         )
-        for pair in pairs
-        if pair.estimate is not None
+        for obj_id, found in by_object.items()
     ]
+    nearest = [NearestPoints(points) for _, _, points, _, _ in cases]
     return {
         "add": lambda: [metrics.add(est, gt, points) for est, gt, points, _, _ in cases],
-        "adi": lambda: [metrics.adi(est, gt, points) for est, gt, points, _, _ in cases],
+        "adi": lambda: [metrics.adi(est, gt, near) for (est, gt, *_), near in zip(cases, nearest, strict=True)],
         "mssd_all_vertices": lambda: [metrics.mssd(est, gt, points, turns) for est, gt, points, turns, _ in cases],
         "mspd_and_proj": lambda: [
             metrics.projection_errors(est, gt, K, points, turns) for est, gt, points, turns, K in cases
