@@ -8,6 +8,7 @@ from posecore.camera import project
 from posecore.errors import DatasetError
 from posecore.mesh import load_mesh
 from posecore.raster import DirectionalLight, Rasteriser, Shading
+from refinenet.baselines.outcome import refined
 from refinenet.baselines.region import signed_distance_px
 from refinenet.baselines.solve import moved, projection_jacobian
 from refinenet.methods import BASELINES, Frame, PoseRefiner, Request, Status, make_baseline
@@ -16,6 +17,7 @@ from scipy.spatial import cKDTree
 from .conftest import HEIGHT_PX, WIDTH_PX, K, background
 
 SEEDS = range(5)
+LMO_OBJECTS = (1, 9)
 
 
 def rendered_frame(mesh, rasteriser, seed):
@@ -46,12 +48,12 @@ def distances(mesh, truth, pose, symmetric=False):
     return np.linalg.norm(at_truth - at_pose, axis=1).mean() / mesh.diameter_m
 
 
-def shares(name, ply, symmetric, angle_deg=7.0, distance=0.05):
-    """Share of seeds that end at under half of the start's error, and the median error before and after."""
+def shares(name, ply, symmetric, angle_deg=7.0, distance=0.05, seeds=SEEDS):
+    """Share of seeds that end at under half of the start's error, and the errors before and after."""
     mesh = load_mesh(ply)
     refiner, before, after = make_baseline(name, {1: mesh}, 5), [], []
     with Rasteriser({1: mesh}) as rasteriser:
-        for seed in SEEDS:
+        for seed in seeds:
             frame, truth = rendered_frame(mesh, rasteriser, seed)
             start = se3.perturb(truth, np.deg2rad(angle_deg), distance * mesh.diameter_m, np.random.default_rng(seed))
             (result,) = refiner.refine_batch(frame, [Request(obj_id=1, T_cam_obj=start)])
@@ -61,20 +63,53 @@ def shares(name, ply, symmetric, angle_deg=7.0, distance=0.05):
             after.append(distances(mesh, truth, result.T_cam_obj, symmetric))
     refiner.close()
     halved = float(np.mean(np.array(after) < 0.5 * np.array(before)))
-    return halved, float(np.median(before)), float(np.median(after))
+    return halved, np.array(before), np.array(after)
 
 
 @pytest.mark.parametrize(("name", "least", "ratio"), [("edge-icp", 0.6, 0.5), ("depth-icp", 0.9, 0.2)])
 def test_small_perturbations_converge(tug_ply, name, least, ratio):
     halved, before, after = shares(name, tug_ply, symmetric=False)
     assert halved >= least
-    assert after < ratio * before
+    assert np.median(after) < ratio * np.median(before)
+
+
+@pytest.mark.parametrize(
+    ("name", "least", "ratio"), [("edge-icp", 0.8, 0.2), ("depth-icp", 0.9, 0.2), ("region", 0.55, 0.4)]
+)
+def test_scanned_objects_converge(shared_data, name, least, ratio):
+    """20 starts. When this was written edge-icp halved 17 of the errors and region 13."""
+    plys = [shared_data / f"lmo/models/obj_{obj_id:06d}.ply" for obj_id in LMO_OBJECTS]
+    halved, before, after = zip(*(shares(name, ply, symmetric=False, seeds=range(10)) for ply in plys), strict=True)
+    assert np.mean(halved) >= least
+    assert np.median(after) < ratio * np.median(before)
+    assert np.mean(np.concatenate(after) < np.concatenate(before)) >= 0.8
+
+
+@pytest.mark.parametrize("name", ["edge-icp", "region"])
+def test_the_truth_stays_where_it_is(shared_data, name):
+    """Pixels that hold both sides of the silhouette's edge count as beside it, which costs region some depth."""
+    _, before, after = shares(name, shared_data / "lmo/models/obj_000001.ply", symmetric=False, angle_deg=0, distance=0)
+    assert before.max() < 1e-9
+    assert np.median(after) < 0.03
+
+
+def test_a_pose_far_from_its_start_has_diverged(tug):
+    start = se3.make_T(np.eye(3), np.array([0, 0, 0.6]))
+    turned = se3.make_T(se3.rotation_from_rotvec(np.array([0, np.deg2rad(70), 0])), start[:3, 3])
+    moved_off = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.8 * tug.diameter_m]))
+    near = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.7 * tug.diameter_m]))
+    for pose, words in ((turned, "turned by 70 deg and moved by 0.0 d"), (moved_off, "by 0 deg and moved by 0.8 d")):
+        result = refined(start, pose, pose, 9, tug.diameter_m)
+        assert result.status is Status.FAILED
+        assert words in result.failure
+        np.testing.assert_array_equal(result.T_cam_obj, start)
+    assert refined(start, near, near, 9, tug.diameter_m).status is Status.CONVERGED
 
 
 @pytest.mark.parametrize("name", ["edge-icp", "depth-icp"])
 def test_a_symmetric_object_converges_to_one_of_its_poses(bobbin_ply, name):
     _, before, after = shares(name, bobbin_ply, symmetric=True)
-    assert after < 0.7 * before
+    assert np.median(after) < 0.7 * np.median(before)
 
 
 @pytest.fixture(scope="module")

@@ -73,7 +73,7 @@ def refine_by_depth(
     if best.support < MIN_SUPPORT:
         why = f"depth confirms {best.support:.0%} of the surface in the end, {MIN_SUPPORT:.0%} needed"
         return failed(T_cam_obj, best.iterations, why)
-    return refined(best.before, best.pose, best.iterations, target.mesh.diameter_m)
+    return refined(T_cam_obj, best.before, best.pose, best.iterations, target.mesh.diameter_m)
 
 
 def _look(frame: Frame, pose: Float[Array, "4 4"], target: Target) -> View | None:

@@ -91,7 +91,7 @@ def refine_by_edges(
     support = float(near.found.any(axis=1).mean()) if len(near.found) else 0.0
     if support < MIN_SUPPORT:
         return failed(T_cam_obj, done, f"{support:.0%} of its edges end on one in the image, {MIN_SUPPORT:.0%} needed")
-    return refined(before, pose, done, target.mesh.diameter_m)
+    return refined(T_cam_obj, before, pose, done, target.mesh.diameter_m)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,6 +18,9 @@ SMALL_ANGLE_RAD = np.deg2rad(0.5)
 SMALL_DISTANCE = 0.01
 """Under this angle and this share of the diameter, an update is small."""
 
+FAR_DEG, FAR_DIAMETERS = 60.0, 0.75
+"""A pose further from its start than this, in angle or diameters, has diverged. Chosen on renders."""
+
 
 class Baseline(ABC):
     """A `PoseRefiner` that goes through the poses one by one.
@@ -59,8 +62,26 @@ def failed(start: Float[Array, "4 4"], iterations: int, why: str) -> Refinement:
     return Refinement(T_cam_obj=T, status=Status.FAILED, iterations=iterations, failure=why)
 
 
-def refined(before: Float[Array, "4 4"], after: Float[Array, "4 4"], iterations: int, diameter_m: float) -> Refinement:
-    """The pose `after`, converged if the last update, which led there from `before`, was small."""
+def refined(
+    start: Float[Array, "4 4"],
+    before: Float[Array, "4 4"],
+    after: Float[Array, "4 4"],
+    iterations: int,
+    diameter_m: float,
+) -> Refinement:
+    """The pose `after`, converged if the last update, which led there from `before`, was small.
+
+    It failed where it is too far from the start for a local method: what it found there is something else.
+    """
+    dR, dt_m = se3.update_between(start, after)
+    turned_deg, moved_by = np.rad2deg(se3.rotation_angle_rad(dR)), np.linalg.norm(dt_m) / diameter_m
+    if not (turned_deg <= FAR_DEG and moved_by <= FAR_DIAMETERS):
+        return failed(
+            start,
+            iterations,
+            f"it diverged: turned by {turned_deg:.0f} deg and moved by {moved_by:.1f} diameters, "
+            f"{FAR_DEG:.0f} deg and {FAR_DIAMETERS:g} diameters are in its reach",
+        )
     dR, dt_m = se3.update_between(before, after)
     small = se3.rotation_angle_rad(dR) < SMALL_ANGLE_RAD and np.linalg.norm(dt_m) < SMALL_DISTANCE * diameter_m
     return Refinement(T_cam_obj=after, status=Status.CONVERGED if small else Status.STOPPED, iterations=iterations)

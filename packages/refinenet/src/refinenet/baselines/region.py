@@ -6,7 +6,6 @@ Global colour histograms, pixel-wise posteriors and a smoothed step over the sil
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from posecore.camera import back_project
@@ -19,17 +18,18 @@ from refinenet.baselines.view import Target, View, finest_px, look
 from refinenet.methods import Frame, Refinement
 
 Array = np.ndarray
-LEVELS = (0.3, 0.55, 1.0)
-"""Patch side as a share of the finest. Like all below: chosen on renders."""
+LEVELS = ((0.3, 0.09), (0.55, 0.045), (1.0, 0.01))
+"""Patch side as a share of the finest, and the margin along the silhouette whose colours are not learnt, as a share of
+that side. Like all below: chosen on renders."""
 FINEST_PX = 200
 LEAST_PATCH_PX = 48
 BINS = 32
-BAND_PX = 8.0
+BAND_PX = 10.0
 """Pixels this near the silhouette count."""
 SHARPNESS = 1.0
 """Of the smoothed step, per pixel."""
-ADAPTATION = 0.25
-"""Weight of the newest histograms after each level, as the silhouette fits better then."""
+RENDER_SHARE = 0.4
+"""Weight of the render's colours among the object's: parts along its edge are in no margin there."""
 MIN_CONTOUR = 20
 MIN_PIXELS = 40
 MIN_SEPARATION = 0.02
@@ -61,20 +61,22 @@ class Colours:
         mine, other = self.object[r, g, b], self.background[r, g, b]
         return np.asarray((mine + 1e-6) / (mine + other + 2e-6))
 
-    def mixed(self, newer: "Colours", share: float) -> "Colours":
-        """A share of newer ones in these."""
-        return Colours(
-            object=(1 - share) * self.object + share * newer.object,
-            background=(1 - share) * self.background + share * newer.background,
-        )
 
+def colours_of(view: View, margin_px: float) -> Colours | None:
+    """Histograms of the silhouette and of what is beside it; None where one has too few pixels.
 
-def colours_of(view: View) -> Colours | None:
-    """Histograms inside the silhouette and in the rest of the patch; None where one has too few pixels."""
-    inside, outside = view.mask & view.in_image, ~view.mask & view.in_image
+    A margin on either side of the silhouette's edge is left out: where the silhouette is a little off, each side's
+    margin has the other's colours, and colours that are to be seen nowhere else would hold it where it is.
+    """
+    phi = signed_distance_px(view.mask)[0]
+    inside, outside = view.mask & view.in_image, (phi < -margin_px) & view.in_image
+    inside &= phi > min(margin_px, 0.5 * float(phi.max()))
     if inside.sum() < MIN_PIXELS or outside.sum() < MIN_PIXELS:
         return None
-    return Colours(object=_histogram(view.scene_rgb[inside]), background=_histogram(view.scene_rgb[outside]))
+    seen, rendered = _histogram(view.scene_rgb[inside]), _histogram(view.rgb[view.mask])
+    return Colours(
+        object=(1 - RENDER_SHARE) * seen + RENDER_SHARE * rendered, background=_histogram(view.scene_rgb[outside])
+    )
 
 
 def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
@@ -96,39 +98,45 @@ def refine_by_regions(
     Args:
         image: RGB.
         K: Its camera.
-        T_cam_obj: Start pose, metres; its silhouette gives the first histograms.
+        T_cam_obj: Start pose, metres; its silhouette gives the first histograms, the pose of each level the next ones.
         target: Object.
         iterations: Times `STEPS_A_RENDER` renders, each with one Gauss-Newton step, at each of three resolutions.
     """
     before = pose = np.asarray(T_cam_obj, np.float64)
     finest = finest_px(K, pose, target.mesh, FINEST_PX)
-    view = look(image, K, pose, target, finest) if finest else None
-    if view is None:
+    if not finest:
         return failed(T_cam_obj, 0, "the start pose shows nothing of the object in the image")
-    colours = colours_of(view)
-    if colours is None:
-        return failed(T_cam_obj, 0, f"under {MIN_PIXELS} pixels of object or background to learn colours from")
-    length_m, done = target.mesh.diameter_m / 2, 0
-    for share in LEVELS:
+    length_m, done, probable = target.mesh.diameter_m / 2, 0, image
+    for share, margin in LEVELS:
         patch_px = max(LEAST_PATCH_PX, round(share * finest))
+        view = look(image, K, pose, target, finest)
+        if view is None:
+            return failed(T_cam_obj, done, "the object is not in the image")
+        colours = colours_of(view, margin * finest)
+        if colours is None:
+            return failed(T_cam_obj, done, f"under {MIN_PIXELS} pixels of object or background to learn colours from")
+        probable = _as_image(colours.posterior(image))
         for _ in range(STEPS_A_RENDER * iterations):
-            view = look(image, K, pose, target, patch_px)
+            view = look(probable, K, pose, target, patch_px)
             if view is None:
                 return failed(T_cam_obj, done, "the object is not in the image")
             if (contour_mask(view.mask) & view.in_image).sum() < MIN_CONTOUR:
                 return failed(T_cam_obj, done, f"the silhouette has under {MIN_CONTOUR} pixels of contour in the image")
-            before, pose = pose, moved(pose, _update(view, colours, pose, length_m), length_m)
+            before, pose = pose, moved(pose, _update(view, pose, length_m), length_m)
             done += 1
-        view = look(image, K, pose, target, finest)
-        newer = None if view is None else colours_of(view)
-        if view is None or newer is None:
-            return failed(T_cam_obj, done, "the object left the image")
-        colours = colours.mixed(newer, ADAPTATION)
-    probable = colours.posterior(view.scene_rgb)
-    separation = probable[view.mask & view.in_image].mean() - probable[~view.mask & view.in_image].mean()
+    view = look(probable, K, pose, target, finest)
+    if view is None:
+        return failed(T_cam_obj, done, "the object left the image")
+    at = view.scene_rgb[..., 0] / 255
+    separation = at[view.mask & view.in_image].mean() - at[~view.mask & view.in_image].mean()
     if separation < MIN_SEPARATION:
         return failed(T_cam_obj, done, "object and background have the same colours")
-    return refined(before, pose, done, target.mesh.diameter_m)
+    return refined(T_cam_obj, before, pose, done, target.mesh.diameter_m)
+
+
+def _as_image(probable: Float[Array, "h w"]) -> UInt8[Array, "h w 3"]:
+    """Posteriors as grey levels, cut and scaled like an image: colours are looked up before they are blended."""
+    return np.repeat(np.round(255 * probable).astype(np.uint8)[..., None], 3, axis=2)
 
 
 def signed_distance_px(mask: Bool[Array, "p p"]) -> tuple[Float[Array, "p p"], Array]:
@@ -140,11 +148,14 @@ def signed_distance_px(mask: Bool[Array, "p p"]) -> tuple[Float[Array, "p p"], A
     return np.where(mask, distance + 0.5, 0.5 - distance), nearest
 
 
-def _update(view: View, colours: Colours, pose: Float[Array, "4 4"], length_m: float) -> Float[Array, "6"]:
-    """One Gauss-Newton step on the summed negative log likelihood of the pixels around the silhouette."""
+def _update(view: View, pose: Float[Array, "4 4"], length_m: float) -> Float[Array, "6"]:
+    """One Gauss-Newton step on the summed negative log likelihood of the pixels around the silhouette.
+
+    The view's image holds posteriors, see `_as_image`.
+    """
     phi, nearest = signed_distance_px(view.mask)
     row, column = np.nonzero((np.abs(phi) < BAND_PX) & view.in_image)
-    probable = colours.posterior(cv2.GaussianBlur(view.scene_rgb, (0, 0), 0.7))[row, column]
+    probable = view.scene_rgb[row, column, 0] / 255
     at = phi[row, column]
     # Logistic, not the arc tangent of the paper, whose long tails let far pixels push the size.
     inside = 1 / (1 + np.exp(-SHARPNESS * at))
