@@ -186,3 +186,16 @@ def test_each_depth_is_asked_for():
     track.take(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
     depths = [request.T_cam_obj[2, 3] / pose(8)[2, 3] for request in track.wanted(1, [])]
     np.testing.assert_allclose(depths, [1.0, 0.97, 1.03])
+
+
+def test_a_depth_is_left_only_for_one_that_is_clearly_better():
+    nearer = pose(8, z=0.68)
+    for confidence, z in ((0.61, 0.7), (0.63, 0.68)):
+        track = Track(obj_id=1, config=TrackingConfig())
+        track.take(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
+        track.wanted(1, [])
+        results = [(pose(8), 0.6), (nearer, confidence), (pose(8, z=0.72), 0.5)]
+        tracked = track.take(
+            1, [Refinement(T_cam_obj=T, status=Status.CONVERGED, iterations=1, confidence=c) for T, c in results]
+        )
+        assert tracked.T_cam_obj[2, 3] == pytest.approx(z)

@@ -70,7 +70,7 @@ def refine_estimates(
     with drawing or nullcontext() as painter:
         for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
             rows = list(group)
-            frame = _frame(dataset, scene_id, im_id, method)
+            frame = load_frame(dataset, scene_id, im_id, method)
             requests = [Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in rows]
             begun = time.perf_counter()
             found = method.refine_batch(frame, requests)
@@ -98,7 +98,12 @@ def refine_estimates(
     )
 
 
-def _frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:
+def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:
+    """An image with its camera, and with its depth where the method needs that.
+
+    Raises:
+        DatasetError: There is none, or it is damaged.
+    """
     depth_m = dataset.depth_m(scene_id, im_id) if method.needs_depth else None
     if method.needs_depth and depth_m is None:
         raise DatasetError(

@@ -14,7 +14,8 @@ from posecore.bop.images import COLOUR_EXTENSIONS, read_rgb
 from posecore.camera import intrinsics
 from posecore.errors import CameraError, ConfigError, DatasetError
 
-from refinenet.methods import Frame
+from refinenet.estimates import load_frame
+from refinenet.methods import Frame, PoseRefiner
 
 Array = np.ndarray
 
@@ -32,8 +33,12 @@ class FrameSequence(Protocol):
         """How many frames there are; of a video as its file says."""
         ...
 
-    def frames(self) -> Iterator[tuple[int, Frame]]:
-        """Yield image number and frame."""
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
+        """Yield image number and frame, with depth where the method needs it.
+
+        Raises:
+            DatasetError: A frame has none.
+        """
         ...
 
 
@@ -47,11 +52,10 @@ class BopScene:
     def __len__(self) -> int:
         return len(self._numbers())
 
-    def frames(self) -> Iterator[tuple[int, Frame]]:
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
         """Yield image id and frame."""
         for im_id in self._numbers():
-            K = self.dataset.camera(self.scene_id, im_id).K
-            yield im_id, Frame(image=self.dataset.rgb(self.scene_id, im_id), K=K)
+            yield im_id, load_frame(self.dataset, self.scene_id, im_id, method)
 
     def _numbers(self) -> list[int]:
         return sorted(self.dataset.annotated_im_ids(self.scene_id, "camera"))
@@ -73,8 +77,9 @@ class ImageFolder:
     def __len__(self) -> int:
         return len(self._files())
 
-    def frames(self) -> Iterator[tuple[int, Frame]]:
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
         """Yield number and frame."""
+        _refuse_depth(method, self.folder)
         files = self._files()
         are_numbers = all(file.stem.isdecimal() for file in files)
         if are_numbers:
@@ -107,8 +112,9 @@ class VideoFile:
         video.release()
         return max(count, 0)
 
-    def frames(self) -> Iterator[tuple[int, Frame]]:
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
         """Yield number and frame."""
+        _refuse_depth(method, self.file)
         video = cv2.VideoCapture(str(self.file))
         try:
             number = 0
@@ -122,6 +128,11 @@ class VideoFile:
             video.release()
         if number == 0:
             raise DatasetError(f"{self.file}: no frame can be decoded; convert it, or give a folder of images")
+
+
+def _refuse_depth(method: PoseRefiner, source: Path) -> None:
+    if method.needs_depth:
+        raise DatasetError(f"{source}: images and videos have no depth, which {method.name} needs; give a BOP dataset")
 
 
 def open_sequence(source: Path, *, split: str | None, scene: int | None, camera: Path | None) -> FrameSequence:

@@ -73,7 +73,7 @@ def track_sequence(
     with ExitStack() as held:
         writer = held.enter_context(VideoWriter(video, fps)) if video else None
         painter = held.enter_context(closing(Overlay(meshes))) if video else None
-        for number, frame in sequence.frames():
+        for number, frame in sequence.frames(tracker.refiner):
             started = time.perf_counter()
             found = tracker.step(number, frame, offered(number))
             taken_s = time.perf_counter() - started

@@ -20,6 +20,9 @@ from refinenet.tracking import (
 )
 
 Array = np.ndarray
+DEPTH_MARGIN = 0.02
+"""By so much a start from nearer or farther has to be more confident: less is noise, and depth would jump with it."""
+
 VELOCITY_SIGHTINGS = 5
 """Velocity is measured over so many frames: between two alone it would be noise, in depth above all."""
 
@@ -86,7 +89,7 @@ class Track:
         """Result and new state of a frame, from the refinements of what was wanted in it, in their order."""
         if not results:
             return self._without("there is no pose to start from in this frame", 0.0)
-        best = max(range(len(results)), key=lambda i: _confidence(results[i]))
+        best = self._best(results)
         found, confidence = results[best], _confidence(results[best])
         gap = self.standing.missed > 0 or self.standing.state is TrackState.LOST
         self.standing = next_standing(self.standing, confidence, self.config)
@@ -102,6 +105,14 @@ class Track:
         return Tracked(
             obj_id=self.obj_id, state=self.standing.state, T_cam_obj=pose, confidence=confidence, restarted=restarted
         )
+
+    def _best(self, results: Sequence[Refinement]) -> int:
+        """The most confident result; of one start's three depths its own, unless another's is clearly more so."""
+        best = max(range(len(results)), key=lambda i: _confidence(results[i]))
+        if best >= self._own or not self.config.depth_step:
+            return best
+        own = 3 * (best // 3)
+        return best if _confidence(results[best]) > _confidence(results[own]) + DEPTH_MARGIN else own
 
     def _without(self, why: str, confidence: float) -> Tracked:
         return Tracked(
@@ -126,6 +137,9 @@ class Tracker:
         config: When a pose fits.
         symmetries: By object id, of those that have any.
         motion: Whether poses are predicted with constant velocity.
+
+    Attributes:
+        refiner: Method.
     """
 
     def __init__(
@@ -137,7 +151,7 @@ class Tracker:
         symmetries: Mapping[int, Symmetric] | None = None,
         motion: bool = False,
     ) -> None:
-        self._refiner = refiner
+        self.refiner = refiner
         known = symmetries or {}
         self._tracks = [
             Track(obj_id=i, config=config, symmetries=known.get(i), motion=motion) for i in sorted(set(obj_ids))
@@ -159,7 +173,7 @@ class Tracker:
         starts = offered or {}
         wanted = [track.wanted(number, starts.get(track.obj_id, ())) for track in self._tracks]
         requests = [request for of_track in wanted for request in of_track]
-        results = iter(self._refiner.refine_batch(frame, requests) if requests else [])
+        results = iter(self.refiner.refine_batch(frame, requests) if requests else [])
         return [
             track.take(number, [next(results) for _ in of_track])
             for track, of_track in zip(self._tracks, wanted, strict=True)

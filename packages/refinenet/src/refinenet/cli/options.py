@@ -4,8 +4,16 @@ from pathlib import Path
 
 import click
 
+from refinenet.methods import BASELINES, NETWORK
+
 FILE = click.Path(path_type=Path)
 NEW_FILE = click.Path(path_type=Path, dir_okay=False)
+method_option = click.option(
+    "--method", type=click.Choice([NETWORK, *BASELINES]), default=NETWORK, help="What refines the poses."
+)
+checkpoint_option = click.option(
+    "--checkpoint", type=FILE, metavar="FILE", help="Trained network (.safetensors), for --method network."
+)
 device_option = click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", help="Where the network runs."
 )
@@ -20,3 +28,10 @@ other_mesh_option = click.option(
 )
 quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
 verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")
+
+
+def require_fit(method: str, checkpoint: Path | None) -> None:
+    """Refuse a network without a checkpoint, and a baseline with one."""
+    if (checkpoint is None) == (method == NETWORK):
+        needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
+        raise click.UsageError(f"--method {method} {needs}")

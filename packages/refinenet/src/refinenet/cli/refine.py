@@ -10,14 +10,17 @@ from refinenet.cli.console import progress_bar, start_logging, stoppable
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
+    checkpoint_option,
     device_option,
     iterations_option,
+    method_option,
     other_mesh_option,
     quiet_option,
+    require_fit,
     threads_option,
     verbose_option,
 )
-from refinenet.methods import BASELINES, NETWORK, make_baseline
+from refinenet.methods import make_baseline
 
 if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
@@ -26,8 +29,8 @@ SHOWN_FAILURES = 5
 
 
 @click.command()
-@click.option("--method", type=click.Choice([NETWORK, *BASELINES]), default=NETWORK, help="What refines the poses.")
-@click.option("--checkpoint", type=FILE, metavar="FILE", help="Trained network (.safetensors), for --method network.")
+@method_option
+@checkpoint_option
 @click.option("--dataset", required=True, type=FILE, metavar="DIR", help="BOP dataset with the images.")
 @click.option("--split", metavar="NAME", help="Split folder. [test, val, train_pbr, train or the only one]")
 @click.option("--init", required=True, type=FILE, metavar="CSV", help="Start poses, a BOP result file.")
@@ -85,9 +88,7 @@ def refine(
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out pool.csv --hypotheses 16
     """
     start_logging(verbose)
-    if (checkpoint is None) == (method == NETWORK):
-        needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
-        raise click.UsageError(f"--method {method} {needs}")
+    require_fit(method, checkpoint)
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 

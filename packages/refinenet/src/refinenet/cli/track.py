@@ -1,6 +1,7 @@
 """`refinenet track`."""
 
 import re
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +12,13 @@ from refinenet.cli.console import progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
+    checkpoint_option,
     device_option,
     iterations_option,
+    method_option,
     other_mesh_option,
     quiet_option,
+    require_fit,
     threads_option,
     verbose_option,
 )
@@ -30,7 +34,8 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("source", type=FILE)
-@click.option("--checkpoint", required=True, type=FILE, metavar="FILE", help="Trained network (.safetensors).")
+@method_option
+@checkpoint_option
 @click.option("--out", required=True, type=NEW_FILE, metavar="CSV", help="Poses, a BOP result file.")
 @click.option("--init", type=FILE, metavar="CSV", help="BOP result file to start from, and to start again when lost.")
 @click.option(
@@ -43,7 +48,7 @@ if TYPE_CHECKING:
 @click.option("--camera", type=FILE, metavar="JSON", help="Camera of images or a video: a BOP camera.json.")
 @click.option(
     "--mesh", "mesh_files", type=FILE, multiple=True, metavar="FILE",
-    help="Mesh (mm) for images or a video; obj_000005.ply is object 5, else the checkpoint's only one. Repeatable.",
+    help="Mesh (mm) for images or a video; obj_000005.ply is object 5, else the only one known. Repeatable.",
 )  # fmt: skip
 @click.option("--object", "objects", type=int, multiple=True, help="Track only this object. Repeatable. [all]")
 @iterations_option
@@ -52,8 +57,9 @@ if TYPE_CHECKING:
 @click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.2]")
 @click.option("--patience", type=click.IntRange(1), default=5, help="Frames without a pose until an object is lost.")
 @click.option(
-    "--depth-step", type=click.FloatRange(0, 0.5, max_open=True), default=0.02,
-    help="Also try each pose nearer and farther by this share of its depth; 0 is faster, and depth may drift.",
+    "--depth-step", type=click.FloatRange(0, 0.5, max_open=True),
+    help="Also try each pose nearer and farther by this share of its depth; 0 is faster, and depth may drift. "
+    "[0.02; 0 for a method without confidences]",
 )  # fmt: skip
 @click.option("--video", type=NEW_FILE, metavar="FILE", help="Write a video (.mp4, .avi) with contours and states.")
 @click.option("--fps", type=click.FloatRange(0.1), default=30.0, help="Frames a second of --video.")
@@ -65,7 +71,8 @@ if TYPE_CHECKING:
 @verbose_option
 def track(
     source: Path,
-    checkpoint: Path,
+    method: str,
+    checkpoint: Path | None,
     out: Path,
     init: Path | None,
     pose: Path | None,
@@ -79,7 +86,7 @@ def track(
     sure: float | None,
     found: float | None,
     patience: int,
-    depth_step: float,
+    depth_step: float | None,
     video: Path | None,
     fps: float,
     name: str | None,
@@ -96,10 +103,12 @@ def track(
 
     \b
     refinenet track choi --scene 1 --checkpoint best.safetensors --init start.csv --out results/track.csv
+    refinenet track choi --scene 1 --method edge-icp --init start.csv --out results/edges.csv
     refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
         --out track.csv --video annotated.mp4
     """
     start_logging(verbose)
+    require_fit(method, checkpoint)
     if (init is None) == (pose is None):
         raise click.UsageError("give either --init or --pose: where the objects are at the start")
     import torch
@@ -107,28 +116,32 @@ def track(
 
     from refinenet import __version__
     from refinenet import checkpoint as checkpoints
+    from refinenet.methods import PoseRefiner, make_baseline
     from refinenet.refine import Refiner
     from refinenet.sequence import BopScene, open_sequence
     from refinenet.track import TrackLog, track_sequence
     from refinenet.tracker import Tracker
-    from refinenet.tracking import GRADIENT_TRACKING, LEARNED_TRACKING, TrackingConfig
+    from refinenet.tracking import GRADIENT_TRACKING, LEARNED_TRACKING, UNJUDGED_TRACKING, TrackingConfig
 
     if threads:
         torch.set_num_threads(threads)
-    loaded = checkpoints.load(checkpoint)
+    loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     sequence = open_sequence(source, split=split, scene=scene, camera=camera)
     starts = _Starts(init, pose, sequence, objects)
     meshes, infos = _models(sequence, mesh_files, loaded, starts.obj_ids)
     log, stopped = TrackLog(), False
-    with Refiner(
-        loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh
-    ) as refiner, progress_bar(quiet) as bar:  # fmt: skip
+    refiner: PoseRefiner
+    if loaded is None:
+        refiner, usual = make_baseline(method, meshes, iterations), UNJUDGED_TRACKING
+    else:
+        refiner = Refiner(loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh)
         usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
+    with closing(refiner), progress_bar(quiet) as bar:
         config = TrackingConfig(
             sure=usual.sure if sure is None else sure,
             found=usual.found if found is None else found,
             patience=patience,
-            depth_step=depth_step,
+            depth_step=usual.depth_step if depth_step is None else depth_step,
         )
         symmetries = {i: info for i, info in infos.items() if info.is_symmetric}
         tracker = Tracker(refiner, starts.obj_ids, config, symmetries=symmetries, motion=motion_model)
@@ -143,9 +156,9 @@ def track(
         sidecar: dict[str, Any] = {"method": name or f"{refiner.name}, tracking"}
         if isinstance(sequence, BopScene):
             sidecar |= {"dataset": str(sequence.dataset.root.resolve()), "split": sequence.dataset.split}
+        if loaded is not None:
+            sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
         sidecar |= {
-            "checkpoint": loaded.path.name,
-            "checkpoint_sha256": loaded.sha256,
             "settings": {
                 "refinenet": __version__, **refiner.settings, "motion_model": motion_model, "sure": config.sure,
                 "found": config.found, "patience_frames": config.patience, "depth_step": config.depth_step,
@@ -207,7 +220,7 @@ def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
 
 
 def _models(
-    sequence: "FrameSequence", files: tuple[Path, ...], loaded: "Checkpoint", obj_ids: list[int]
+    sequence: "FrameSequence", files: tuple[Path, ...], loaded: "Checkpoint | None", obj_ids: list[int]
 ) -> "tuple[dict[int, Mesh], dict[int, ModelInfo]]":
     """Meshes and symmetries of the objects: the dataset's, or files with a models_info.json beside them."""
     from posecore.bop.jsonfile import read_json
@@ -221,15 +234,15 @@ def _models(
             raise ConfigError("--mesh is for images and videos; a BOP dataset brings its own models")
         infos = sequence.dataset.models_info
         return {i: sequence.dataset.mesh(i) for i in obj_ids}, {i: infos[i] for i in obj_ids if i in infos}
-    trained = sorted(map(int, loaded.provenance.objects))
+    known = obj_ids if loaded is None else sorted(map(int, loaded.provenance.objects))
     meshes: dict[int, Mesh] = {}
     symmetric: dict[int, ModelInfo] = {}
     for file in files:
         numbered = re.fullmatch(r"obj_(\d+)", file.stem)
-        if numbered is None and len(trained) > 1:
-            some = ", ".join(map(str, trained))
-            raise ConfigError(f"{file}: the checkpoint knows objects {some}; name the file obj_000001.ply to say which")
-        obj_id = int(numbered[1]) if numbered else trained[0]
+        if numbered is None and len(known) > 1:
+            some, who = ", ".join(map(str, known)), "start poses are of" if loaded is None else "the checkpoint knows"
+            raise ConfigError(f"{file}: {who} objects {some}; name the file obj_000001.ply to say which")
+        obj_id = int(numbered[1]) if numbered else known[0]
         meshes[obj_id] = load_mesh(file, units="mm")
         info_file = file.with_name("models_info.json")
         listed = read_json(info_file) if info_file.is_file() else {}
