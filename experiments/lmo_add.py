@@ -38,7 +38,7 @@ from experiments.common import (
 # As far as the start poses of the paper are off in the mean: 34 degrees, a tenth of a diameter across the image and six
 # times as much in depth.
 REACH = (
-    "--set hypothesis.max_angle_deg=60 --set hypothesis.max_translation_diameter=0.35 --set hypothesis.depth_stretch=6"
+    "--set hypothesis.max_angle_deg=45 --set hypothesis.max_translation_diameter=0.25 --set hypothesis.depth_stretch=6"
 )
 TRAINING = {
     "smoke": f"--steps 16 --batch 8 --set validation.pairs=16 --threads 1 {REACH}",
