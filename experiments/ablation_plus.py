@@ -14,6 +14,8 @@ Every network sees the same pairs in the same order for the same number of steps
   background, occlusion, colour   that augmentation is off
   average          the weights themselves instead of their running average
 
+`--small` has `paper-choices` beside them: every switch off at once, as in the paper, with the same network.
+
 Test images are other scenes; starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
 
   --smoke  two networks, 16 training steps: a test of the plumbing
@@ -78,6 +80,9 @@ def networks(size: str, inputs: Inputs) -> dict[str, Network]:
     off = {"own-predictions": OFF["own-predictions"]} if size == "smoke" else OFF
     made = {"all": Network(train=base, pairs=pairs)}
     made |= {f"without-{name}": Network(train=f"{base} {settings(text)}", pairs=pairs) for name, text in off.items()}
+    if size == "small":
+        choices = " ".join(text for name, text in OFF.items() if name != "contour-loss")
+        made["paper-choices"] = Network(train=f"{base} {settings(choices)}", pairs=pairs)
     if size == "full":
         made["paper"] = Network(train=f"--preset paper {inputs.stem()}", pairs="--set hypotheses_per_scene=1")
     return made
