@@ -130,7 +130,6 @@ class Comparison:
         init: Start poses for them, instead of perturbed ones.
         workers: Processes that render test images.
         render: Options of `synthgen render` that say where it runs.
-        refine: Further options of `refinenet refine` with a network.
         tested: Options of `synthgen` that name the meshes in test images, where those are others.
     """
 
@@ -147,7 +146,6 @@ class Comparison:
     init: Path | None = None
     workers: int = 2
     render: str = "--workers 2"
-    refine: str = ""
     tested: str | None = None
 
 
@@ -166,7 +164,7 @@ def compared(work: Path, what: Comparison) -> list[Step]:
     refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations}"
     results = []
     for name, network in what.networks.items():
-        steps += refinements(work, what, f"{refine} {what.refine}", name, network)
+        steps += refinements(work, what, refine, name, network)
         results.append(name)
     for name in what.baselines:
         steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))

@@ -2,8 +2,7 @@
 
     python experiments/cups.py cups --count 8 --seed 0
 
-All are scaled to one diameter. The unseen one is called `unseen/obj_000001.ply`: a network knows objects by
-their numbers, so an unseen member goes by the number of a trained one.
+All are scaled to one diameter. The unseen one is `unseen/obj_000001.ply`, in a models folder of its own.
 """
 
 import argparse

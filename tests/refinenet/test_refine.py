@@ -331,6 +331,24 @@ def test_another_mesh_of_the_same_size_is_refused_and_a_copy_is_not(mesh, traine
     Refiner(loaded, {1: painted}, allow_other_mesh=True).close()
 
 
+def test_a_category_takes_unseen_members_of_about_its_size(mesh, trained, frame):
+    loaded = checkpoint.load(trained)
+    config = replace(
+        loaded.provenance.config, category=True, window=replace(loaded.provenance.config.window, kind="fixed")
+    )
+    loaded = replace(loaded, provenance=replace(loaded.provenance, config=config))
+    member = replace(mesh, vertices_m=1.1 * mesh.vertices_m, sha256="")
+    image, truths = frame
+    with Refiner(loaded, {7: member}) as refiner:
+        assert not refiner.refine(image, K, truths[0], 7).failed
+    for factor in (0.5, 1000):
+        other = replace(mesh, vertices_m=mesh.vertices_m * factor, sha256="")
+        with pytest.raises(
+            CheckpointError, match=r"object 7 has a diameter of .* mm, expected .* read in another unit"
+        ):
+            Refiner(loaded, {7: other})
+
+
 def save(mesh, path):
     save_ply(mesh, path, units="mm")
     return path

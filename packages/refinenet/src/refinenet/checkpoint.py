@@ -46,6 +46,11 @@ class Provenance:
     objects: dict[str, dict[str, Any]]
     camera_fx_px: float = 0.0
 
+    def window_side_px(self, obj_id: int) -> float:
+        """Side of an object's fixed window in training, pixels; of an unseen member of a category the largest."""
+        cards = [self.objects[str(obj_id)]] if str(obj_id) in self.objects else list(self.objects.values())
+        return max(float(card["window_side_px"]) for card in cards)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Checkpoint:

@@ -11,6 +11,9 @@ from refinenet.checkpoint import Checkpoint
 from refinenet.methods import Frame
 
 DIAMETER_TOLERANCE = 0.02
+MEMBER_SIZES = (0.8, 1.25)
+"""Smallest and largest member of a category, as shares of the smallest and largest trained one's diameter."""
+
 CENTRE_TOLERANCE = 0.2
 """A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
 that of an image of another size."""
@@ -29,7 +32,7 @@ def mesh_digest(mesh: Mesh) -> str:
 
 
 def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:
-    """Refuse a mesh that the checkpoint was not trained with.
+    """Refuse a mesh that the checkpoint was not trained with; for a category, one of another size than its members.
 
     The hash decides: that of the file, or `mesh_digest`. A checkpoint that has no `mesh_digest` cannot tell a mesh
     that was written anew from another one of its size; such a mesh passes.
@@ -38,6 +41,9 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
         CheckpointError: The object is not in the training data, has another size, or is another mesh.
     """
     objects = loaded.provenance.objects
+    if loaded.provenance.config.category:
+        _require_member(loaded, obj_id, mesh)
+        return
     if str(obj_id) not in objects:
         known = ", ".join(sorted(objects, key=int))
         raise CheckpointError(
@@ -62,6 +68,17 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
             f"{loaded.path}: object {obj_id} is another mesh than in training ({mesh.path or 'this one'} has digest "
             f"{mesh_digest(mesh)[:12]}, {trained.get('name', 'the trained one')} had {trained['mesh_digest'][:12]}); "
             "give the mesh it was trained with, or pass --allow-other-mesh"
+        )
+
+
+def _require_member(loaded: Checkpoint, obj_id: int, mesh: Mesh) -> None:
+    diameters_m = [float(card["diameter_m"]) for card in loaded.provenance.objects.values()]
+    least_m, most_m = MEMBER_SIZES[0] * min(diameters_m), MEMBER_SIZES[1] * max(diameters_m)
+    if not least_m <= mesh.diameter_m <= most_m:
+        raise CheckpointError(
+            f"{loaded.path}: object {obj_id} has a diameter of {1e3 * mesh.diameter_m:.6g} mm, expected "
+            f"{1e3 * least_m:.1f} to {1e3 * most_m:.1f} mm, as the members of the category that it was trained on: "
+            "no member, or read in another unit"
         )
 
 

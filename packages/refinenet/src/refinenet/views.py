@@ -121,7 +121,7 @@ class Viewer:
         mesh, provenance = self._meshes[obj_id], self._provenance
         if provenance.config.window.kind == "diameter":
             return diameter_window(K, T, mesh.center_m, mesh.diameter_m, provenance.config.window.scale)
-        side_px = float(provenance.objects[str(obj_id)]["window_side_px"])
+        side_px = provenance.window_side_px(obj_id)
         # The same share of the field of view as in training, so that another camera shows the object at the same size.
         scale = float(K[0, 0]) / provenance.camera_fx_px if provenance.camera_fx_px > 0 else 1.0
         return fixed_window(mesh.vertices_m, K, T, side_px * scale)
