@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, read_result_table, result_table, write_results
 from posecore.bop.images import image_size, read_depth, read_rgb
-from posecore.errors import MeshError, PoseError
+from posecore.errors import DatasetError, MeshError, PoseError
 from posecore.mesh import load_mesh
 
 IMAGES = ((2, 0), (2, 5))
@@ -385,6 +385,17 @@ def test_meshes_with_any_header(tmp_path, original, at, new, insert):
     file.write_bytes("\n".join(rows).encode() + b"\n" + end + body)
     mesh = use_or_refuse(load_mesh, file)
     assert mesh is None or (np.isfinite(mesh.vertices_m).all() and mesh.faces.max() < len(mesh.vertices_m))
+
+
+@fuzz
+@given(length=st.integers(0, 5000))
+def test_a_jpeg_that_is_cut_off_is_refused(tmp_path, length):
+    """Its decoder would fill the rest with grey: no bytes of its own give that away."""
+    original = encoded("jpg")
+    file = tmp_path / "a.jpg"
+    file.write_bytes(original[: length % (len(original) - 1)])
+    with pytest.raises(DatasetError, match="cut off"):
+        read_rgb(file)
 
 
 def encoded(extension, dtype=np.uint8):
