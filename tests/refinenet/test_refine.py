@@ -253,6 +253,32 @@ def test_confidence_is_the_networks_where_it_has_one_and_else_of_the_gradients(m
     assert result.confidence == pytest.approx(1 / (1 + np.exp(-2)), abs=0.01)
 
 
+def test_a_real_network_ranks_a_pool_by_its_own_confidence(cli, bop, mesh, frame, tmp_path):
+    """Through the command, on random weights: the scores in the file are what the network says of the poses there."""
+    torch.manual_seed(1)
+    config = load_config("compact", ["network.confidence=true", "network.head_std=0.05"])
+    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
+    provenance = checkpoint.Provenance(
+        config=config, step=1, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
+    )
+    path, out = tmp_path / "sure.safetensors", tmp_path / "pool.csv"
+    checkpoint.save(path, make_network(config.network), provenance)
+    root, start = bop
+    options = ["--hypotheses", 8, "--scorer", "learned", "--iterations", 1, "--threads", 1, "--quiet"]
+    result = cli("refine", "--checkpoint", path, "--dataset", root, "--init", start, "--out", out, *options)
+    assert result.exit_code == 0, result.output
+    settings = read_sidecar(out)["settings"]
+    assert (settings["scorer"], settings["confidence"], settings["hypotheses"]) == ("learned", "learned", 8)
+    found = read_results(out)
+    image, _ = frame
+    with Refiner.load(path, {1: mesh}) as refiner:
+        said = refiner.confidences(
+            Frame(image=image, K=K), [Request(obj_id=1, T_cam_obj=e.T_cam_obj) for e in found], "learned"
+        )
+    np.testing.assert_allclose([e.score for e in found], said, atol=2e-3)  # poses in files are rounded
+    assert len({round(float(value), 4) for value in said}) == len(found) > 1
+
+
 def test_a_pool_is_ranked_and_its_best_is_returned(mesh, trained, frame, monkeypatch):
     """With a network that leaves poses where they are, the pool alone must bring the pose nearer."""
     image, truths = frame
