@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from evalkit import metrics
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.files import load_result_files
 from evalkit.nearest import NearestPoints
 from evalkit.pairing import Pair, pair_up

@@ -403,7 +403,7 @@ def test_a_split_without_public_truth_passes(root):
 
 def test_truth_that_does_not_score_perfectly_is_a_violation(root, monkeypatch):
     """What the check is for: an evaluation that is off by anything at all."""
-    from evalkit.evaluate import Evaluator
+    from evalkit.evaluator import Evaluator
 
     evaluate = Evaluator.evaluate
 

@@ -1,6 +1,7 @@
 """The pipeline: perfect scores for the truth, missing estimates, instances, both kinds of VSS, crops against frames."""
 
 import json
+import os
 import shutil
 import sys
 from dataclasses import replace
@@ -11,7 +12,7 @@ import pandas as pd
 import pytest
 from evalkit import silhouette
 from evalkit.curves import by_level
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.files import ResultFile, load_result_files
 from evalkit.metrics import vss
 from evalkit.pairing import Pair, pair_up
@@ -22,7 +23,7 @@ from evalkit.summary import start_of
 from evalkit.table import column, table_of
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, GroundTruth, Target, symmetry_transforms, write_results, write_targets
-from posecore.errors import DatasetError, ResultFileError
+from posecore.errors import DatasetError, RenderError, ResultFileError
 
 from .conftest import BOBBIN, CAMERA, IMAGES, TUG
 
@@ -60,7 +61,7 @@ def test_values_do_not_depend_on_workers_or_blocks(dataset, perfect, monkeypatch
     with Evaluator(dataset) as one, Evaluator(dataset, workers=2) as two:
         whole = one.evaluate(pairs, done.append)
         parallel = two.evaluate(pairs, done.append)
-        monkeypatch.setattr(sys.modules["evalkit.evaluate"], "BLOCK", 4)
+        monkeypatch.setattr(sys.modules["evalkit.evaluator"], "BLOCK", 4)
         monkeypatch.setattr("evalkit.scorer.KEPT_BYTES", 0)
         blocks = one.evaluate(pairs, done.append)
         none = two.evaluate([])
@@ -78,6 +79,13 @@ def test_a_fault_in_a_worker_is_the_error_of_one_process(dataset_path, tmp_path,
     pairs = pair_up(dataset, in_memory(perfect)).pairs
     shutil.rmtree(root / "test/000020/depth")
     with Evaluator(dataset, "visible", workers=2) as evaluator, pytest.raises(DatasetError, match="image 1 has no dep"):
+        evaluator.evaluate(pairs)
+
+
+def test_a_worker_that_dies_is_one_line(dataset, perfect, monkeypatch):
+    monkeypatch.setattr(sys.modules["evalkit.evaluator"], "_start_worker", os.abort)  # takes no arguments
+    pairs = pair_up(dataset, in_memory(perfect)).pairs
+    with Evaluator(dataset, workers=2) as evaluator, pytest.raises(RenderError, match="again with fewer --workers"):
         evaluator.evaluate(pairs)
 
 

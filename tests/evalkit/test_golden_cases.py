@@ -6,7 +6,7 @@ Objects are regular polygons of points and square plates: their distances, proje
 import numpy as np
 import pytest
 from evalkit import metrics
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.pairing import Pair
 from evalkit.scores import scores
 from posecore import se3

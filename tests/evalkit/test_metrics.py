@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from evalkit import metrics, pose_errors
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.files import load_result_files
 from evalkit.pairing import pair_up
 from hypothesis import given

@@ -5,12 +5,21 @@ them. All arrays are C-contiguous float64; poses are `T_cam_obj`, (b, 4, 4), met
 (b, s, 4, 4) where every estimate has its own, the identity first.
 """
 
-from typing import no_type_check
+from collections.abc import Callable
+from typing import Any, no_type_check
 
 import numba
 import numpy as np
 
-_compiled = numba.njit(cache=True, error_model="numpy", nogil=True)
+
+def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile at the first call; where no folder can be written to, each process does so anew."""
+    settings: dict[str, Any] = {"error_model": "numpy", "nogil": True}
+    try:
+        compiled = numba.njit(loop, cache=True, **settings)
+    except RuntimeError:
+        compiled = numba.njit(loop, **settings)
+    return compiled  # type: ignore[no-any-return]
 
 
 @_compiled

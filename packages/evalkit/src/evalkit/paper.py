@@ -6,7 +6,7 @@ from pathlib import Path
 from posecore.bop import BopDataset
 
 from evalkit.curves import by_level, by_level_and_object, level_object_tables, level_tables
-from evalkit.evaluate import Evaluator, VssKind
+from evalkit.evaluator import Evaluator, VssKind
 from evalkit.files import load_result_files
 from evalkit.formats import Table
 from evalkit.perturb import departures

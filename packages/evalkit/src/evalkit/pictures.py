@@ -10,7 +10,7 @@ from posecore.camera import Camera, crop_K
 from posecore.errors import DatasetError, StorageError
 from posecore.window import Window, cut, silhouette_box
 
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 
 Array = np.ndarray
 SIDE_PX = 300

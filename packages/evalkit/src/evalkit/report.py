@@ -12,7 +12,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError
 from posecore.files import write_atomic
 
-from evalkit.evaluate import Evaluator, VssKind
+from evalkit.evaluator import Evaluator, VssKind
 from evalkit.files import load_result_files
 from evalkit.formats import write_tables
 from evalkit.page import report_page

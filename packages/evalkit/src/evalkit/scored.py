@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from evalkit.evaluate import Evaluator, Progress
+from evalkit.evaluator import Evaluator, Progress
 from evalkit.files import ResultFile
 from evalkit.pairing import pair_up
 from evalkit.scores import bop24_precision, with_bop19

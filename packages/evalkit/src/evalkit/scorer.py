@@ -24,7 +24,7 @@ Array = np.ndarray
 KEPT_BYTES = 256_000_000
 """Renders of true poses that are kept for the next result file."""
 
-KEPT_IMAGES = 20_000
+KEPT_IMAGES = 5_000
 """Images whose cameras and true poses are kept."""
 
 Columns = dict[str, Float[Array, " n"]]

@@ -16,7 +16,7 @@ from evalkit.attribution import cause_counts, causes
 from evalkit.bootstrap import score_intervals
 from evalkit.comparison import compare
 from evalkit.curves import by_level
-from evalkit.evaluate import VssKind
+from evalkit.evaluator import VssKind
 from evalkit.scored import CaseKey, Scored
 from evalkit.scores import DEFINITIONS, by_object, scores
 from evalkit.table import column

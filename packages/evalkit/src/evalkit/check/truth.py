@@ -12,7 +12,7 @@ ERRORS = ("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px", "re_r
 
 def check_truth(dataset: BopDataset, scenes: Scenes, images: list[Image], findings: Findings) -> None:
     """Evaluate the true poses of some images as if a method had found them."""
-    from evalkit.evaluate import Evaluator
+    from evalkit.evaluator import Evaluator
     from evalkit.pairing import Pair
 
     pairs = []

@@ -11,7 +11,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
 
-from evalkit.evaluate import Evaluator, VssKind
+from evalkit.evaluator import Evaluator, VssKind
 from evalkit.files import dataset_of, load_result_files
 from evalkit.scored import Scored, score_file
 from evalkit.table import COLUMNS

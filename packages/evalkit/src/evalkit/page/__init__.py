@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from evalkit import html, plots
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.html import Section
 from evalkit.page import about, bins, cases, curves, failures, levels, words
 from evalkit.scored import Scored

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from evalkit import html, pictures
-from evalkit.evaluate import Evaluator
+from evalkit.evaluator import Evaluator
 from evalkit.html import Shot
 from evalkit.scored import CaseKey, Scored
 from evalkit.summary import worst_cases

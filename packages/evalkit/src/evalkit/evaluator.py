@@ -4,6 +4,7 @@ import multiprocessing
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -12,6 +13,7 @@ import numpy as np
 import pandas as pd
 from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.camera import Camera
+from posecore.errors import RenderError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 
@@ -48,7 +50,8 @@ def evaluate(
         results: BOP result file (CSV), translations in millimetres.
         vss: whole silhouettes, or their visible parts, which needs depth images.
         with_vsd: whether VSD is computed where there is depth.
-        workers: number of processes; the values do not depend on it.
+        workers: number of processes; the values do not depend on it. They import the script that calls this, which
+            therefore has to do so under `if __name__ == "__main__":`.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
@@ -136,7 +139,13 @@ class Evaluator:
                 place, block = waiting.popitem()
                 running[self._pool.submit(_score_in_worker, block)] = place
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                yield running.pop(future), future.result()
+                try:
+                    yield running.pop(future), future.result()
+                except BrokenProcessPool as error:
+                    raise RenderError(
+                        f"a process that scored {self.dataset.root} died (out of memory, or a crash in the renderer); "
+                        "start the same command again with fewer --workers"
+                    ) from error
 
     def all_errors(
         self, estimates: Sequence[Estimate], known: tuple[Sequence[Pair], pd.DataFrame] | None = None
