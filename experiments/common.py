@@ -161,7 +161,7 @@ def compared(work: Path, what: Comparison) -> list[Step]:
         )
     if what.init is None:
         steps.append(start_poses(work, what.starts))
-    refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations}"
+    refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations} --keep-failed"
     results = []
     for name, network in what.networks.items():
         steps += refinements(work, what, refine, name, network)

@@ -27,9 +27,10 @@ class Refined:
     """A refined result file in memory.
 
     Attributes:
-        estimates: In the order of the start poses, without the failed ones: evaluation counts them as missing.
+        estimates: In the order of the start poses. Those that failed are left out, and evaluation counts them as
+            missing; or they are the start poses as they were, with score 0.
         start_lines: Line in the start file of each of them.
-        failures: Why the others failed, by their line in the start file.
+        failures: Why poses failed, by their line in the start file.
         converged: How many stopped on a small update.
     """
 
@@ -44,6 +45,7 @@ def refine_estimates(
     starts: Sequence[Estimate],
     method: PoseRefiner,
     *,
+    keep_failed: bool = False,
     overlay: Path | None = None,
     on_image: Callable[[int], None] | None = None,
 ) -> Refined:
@@ -53,6 +55,7 @@ def refine_estimates(
         dataset: Images and cameras.
         starts: Start poses.
         method: With the meshes of all their objects.
+        keep_failed: Whether a start pose whose refinement failed is an estimate, with score 0, or left out.
         overlay: Folder for one picture an image, start contours red, refined ones green.
         on_image: Called after each image with the number of poses in it.
 
@@ -89,7 +92,7 @@ def refine_estimates(
             if on_image is not None:
                 on_image(len(rows))
     pairs = [(start, *result) for start, result in zip(starts, results, strict=True) if result is not None]
-    kept = [(start, result, taken_s) for start, result, taken_s in pairs if not result.failed]
+    kept = [(start, result, taken_s) for start, result, taken_s in pairs if keep_failed or not result.failed]
     return Refined(
         estimates=[_estimate(start, result, taken_s) for start, result, taken_s in kept],
         start_lines=[start.line for start, _, _ in kept],
@@ -115,7 +118,8 @@ def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefin
 
 
 def _estimate(start: Estimate, result: Refinement, taken_s: float) -> Estimate:
-    score = start.score if result.confidence is None else result.confidence
+    unfailed = start.score if result.confidence is None else result.confidence
+    score = 0.0 if result.failed else unfailed
     return replace(start, T_cam_obj=np.asarray(result.T_cam_obj), score=float(score), time_s=taken_s)
 
 
@@ -131,7 +135,7 @@ def make_sidecar(
 ) -> dict[str, Any]:
     """What is written beside a refined result file.
 
-    `start_lines` holds the start file's line of every estimate, `failed_lines` those of the poses without one. What
+    `start_lines` holds the start file's line of every estimate, `failed_lines` those of the poses that failed. What
     the start file's own sidecar says about how its poses were perturbed is carried over.
     """
     sidecar: dict[str, Any] = {"dataset": str(dataset.root.resolve()), "split": dataset.split, "method": name}

@@ -48,6 +48,7 @@ SHOWN_FAILURES = 5
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, help="Of the hypotheses.")
 @click.option("--object", "objects", type=int, multiple=True, help="Refine only this object's poses. Repeatable. [all]")
+@click.option("--keep-failed", is_flag=True, help="Write the start pose of one that fails, with score 0. [left out]")
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
 @click.option("--overlay", type=FILE, metavar="DIR", help="Draw start (red) and refined (green) contours here.")
 @device_option
@@ -68,6 +69,7 @@ def refine(
     scorer: "PoolScorer",
     seed: int,
     objects: tuple[int, ...],
+    keep_failed: bool,
     name: str | None,
     overlay: Path | None,
     device: str,
@@ -80,7 +82,8 @@ def refine(
     """Refine BOP estimates; the result file's sidecar says with what.
 
     A refined pose's score is how well it fits the image, from 0 to 1. Exit code 0 also when some poses fail: they are
-    left out of the file, named on stderr with the reason, and counted on the last line.
+    left out of the file (or kept as they were, --keep-failed), named on stderr with the reason, and counted on the
+    last line.
 
     \b
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out results/refined.csv
@@ -116,7 +119,14 @@ def refine(
     try:
         with stoppable(out), progress_bar(quiet) as bar:
             task = bar.add_task("poses", total=len(starts))
-            result = refine_estimates(bop, starts, refiner, overlay=overlay, on_image=lambda n: bar.advance(task, n))
+            result = refine_estimates(
+                bop,
+                starts,
+                refiner,
+                keep_failed=keep_failed,
+                overlay=overlay,
+                on_image=lambda n: bar.advance(task, n),
+            )
     finally:
         refiner.close()
     sidecar = make_sidecar(
@@ -133,5 +143,5 @@ def refine(
         click.echo(f"Failed: {len(result.failures) - SHOWN_FAILURES} more, listed in {out}.json", err=True)
     click.echo(
         f"{out}: {len(starts)} poses refined, {result.converged} converged, {len(result.failures)} failed"
-        + (" (left out of the file)" if result.failures else "")
+        + (f" ({'start poses kept' if keep_failed else 'left out of the file'})" if result.failures else "")
     )
