@@ -457,6 +457,12 @@ def test_refine_command(cli, bop, trained, tmp_path):
     assert f"Failed: {start}:4: scene 1, image 0, object 1: at z = " in result.stderr
     picture = cv2.imread(str(tmp_path / "pics" / "000001_000000.png"))
     assert picture.shape == (HEIGHT_PX, WIDTH_PX, 3)
+    result = cli("refine", *arguments[:-2], "--iterations", 1, "--keep-failed")
+    assert "1 failed (start poses kept)" in result.stdout
+    kept, sidecar = read_results(out), read_sidecar(out)
+    assert (len(kept), sidecar["start_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
+    assert kept[2].score == 0
+    np.testing.assert_allclose(kept[2].T_cam_obj, starts[2].T_cam_obj)
 
 
 def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
