@@ -195,6 +195,7 @@ class Rasteriser:
     def __init__(self, meshes: Mapping[int, Mesh]) -> None:
         self._meshes = dict(meshes)
         self._context = _thread_context()
+        self._context.__enter__()  # Blender, in the same process, makes a context of its own the current one
         self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
         self._depth_program: Any = self._context.program(
             vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=DEPTH_FRAGMENT_SHADER
@@ -224,6 +225,7 @@ class Rasteriser:
 
     def add(self, obj_id: int, mesh: Mesh) -> None:
         """Add a mesh, or replace the one of this id."""
+        self._context.__enter__()
         self._release(obj_id)
         self._meshes[obj_id] = mesh
 
@@ -258,7 +260,7 @@ class Rasteriser:
             rgb: Whether colours are read back.
             shading: Lights.
         """
-        self._context.__enter__()  # Blender, in the same process, makes a context of its own the current one
+        self._context.__enter__()
         n = len(T_cam_obj)
         K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
