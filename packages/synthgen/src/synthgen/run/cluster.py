@@ -24,6 +24,8 @@ SETTINGS = {
     "distributed.worker.memory.pause": False,
     "distributed.worker.memory.terminate": 0.95,
     "distributed.comm.timeouts.connect": "60s",
+    # By default a worker that needs more than 15 s to start again, on a busy machine, is dropped for good.
+    "distributed.deploy.lost-worker-timeout": "1h",
     "distributed.logging": dict.fromkeys(_TALKATIVE, "critical"),  # for the workers, which read it when they start
 }
 ANSWER_S = 30.0
@@ -64,7 +66,9 @@ def memory_limit_bytes(workers: int) -> int:
 
 
 def revive(local: LocalCluster, suspected: set[Any]) -> set[Any]:
-    """Start workers anew whose nanny has given up: one that dies just when it starts is not always started again.
+    """Start workers anew that the cluster has dropped, or whose nanny has given up.
+
+    One that dies just when it starts is not always started again.
 
     Args:
         local: The cluster.
@@ -75,10 +79,11 @@ def revive(local: LocalCluster, suspected: set[Any]) -> set[Any]:
     """
     nannies = {name: nanny for name, nanny in list(local.workers.items()) if isinstance(nanny, Nanny)}
     dead = {name for name, nanny in nannies.items() if not nanny.is_alive()}
-    if given_up := dead & suspected:
-        for name in given_up:
-            local.workers.pop(name, None)
-            local.sync(nannies[name].close, asynchronous=False)
+    given_up = dead & suspected
+    for name in given_up:
+        local.workers.pop(name, None)
+        local.sync(nannies[name].close, asynchronous=False)
+    if set(local.worker_spec) - set(local.workers):
         with interrupts_ignored():
             local.scale(len(local.worker_spec))
     return dead - given_up
