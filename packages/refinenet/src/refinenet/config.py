@@ -314,6 +314,7 @@ class TrainConfig:
         steps: steps of the run; the cosine schedule ends there.
         seed: of weights, order, hypotheses and augmentation.
         init: checkpoint whose weights the run begins with, of a network of the same settings; empty begins at random.
+        objects: ids of the dataset's objects to train on; empty takes all.
         category: whether the objects are members of a category, so that the network is meant for others of it too.
         threads: torch threads; 0 leaves torch's own choice.
         precision: of the convolutions in training; `auto` is bfloat16 on GPUs and on processors that compute in it,
@@ -338,6 +339,7 @@ class TrainConfig:
     steps: int = 100_000
     seed: int = 0
     init: str = ""
+    objects: tuple[int, ...] = ()
     category: bool = False
     threads: int = 0
     precision: Literal["auto", "float32", "bfloat16"] = "auto"

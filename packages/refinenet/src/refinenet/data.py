@@ -24,7 +24,7 @@ from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
-from refinenet.objects import load_meshes
+from refinenet.objects import for_patches, load_meshes
 from refinenet.recut import fixed_sides_px
 from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
@@ -75,7 +75,7 @@ class PairSource:
         self._rasteriser: Rasteriser | None = None
         if config.recut:
             meshes = load_meshes(self.reader)
-            self._rasteriser = Rasteriser(meshes)
+            self._rasteriser = Rasteriser(for_patches(meshes, config.network.patch_px))
             self._make = PairMaker(
                 meshes=meshes,
                 rasteriser=self._rasteriser,

@@ -9,6 +9,7 @@ import torch
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
 from posecore.mesh import Mesh, load_mesh
 from posecore.shard import ShardReader
+from posecore.simplify import simplified
 
 from refinenet.loss import ObjectPoints
 
@@ -34,6 +35,11 @@ def load_meshes(reader: ShardReader) -> dict[int, Mesh]:
                 copy.write_bytes(reader.file(key))
             meshes[obj_id] = load_mesh(copy, units="mm")
     return meshes
+
+
+def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:
+    """Meshes to draw hypotheses with in training: a face for each pixel of a patch, where there are more."""
+    return {obj_id: simplified(mesh, patch_px**2) for obj_id, mesh in meshes.items()}
 
 
 def load_models(reader: ShardReader) -> dict[int, ModelInfo]:

@@ -27,6 +27,7 @@ from refinenet.data import Batch
 from refinenet.hypothesis import MIN_CONTOUR_PX
 from refinenet.loss import Target, sample_distance
 from refinenet.network import Pair
+from refinenet.objects import for_patches
 from refinenet.recut import hypothesis_window
 from refinenet.split import OWN
 from refinenet.visibility import visible_overlap
@@ -215,7 +216,7 @@ class OwnPredictions:
         self, index: Int[Array, " s"], K: Float[Array, "s 3 3"], T: Float[Array, "s 4 4"]
     ) -> tuple[UInt8[Array, "s p p 3"], Float[Array, "s p p"]]:
         if self._rasteriser is None:
-            self._rasteriser = Rasteriser(self._meshes)
+            self._rasteriser = Rasteriser(for_patches(self._meshes, self._config.network.patch_px))
         p = self._config.network.patch_px
         rgb, depth = np.zeros((len(T), p, p, 3), np.uint8), np.zeros((len(T), p, p), np.float32)
         for i in np.unique(index):

@@ -23,6 +23,7 @@ ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, OWN = range(6)
 """First key of each random stream, so that no two streams of a run share draws."""
 
 RECORD, GROWTH = "data.json", "growth"
+OTHER_OBJECT = -1  # in place of a scene, for samples of objects that are not trained on
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,14 +84,17 @@ class DataRecord:
 
 
 def read_scenes(
-    reader: ShardReader, shards: Sequence[int], *, skip: bool = False
+    reader: ShardReader, shards: Sequence[int], *, skip: bool = False, objects: Sequence[int] = ()
 ) -> tuple[dict[int, Array], dict[int, str]]:
     """Scene of every sample by shard, and what is wrong with the shards that cannot be read.
+
+    Samples of other objects than those asked for have `OTHER_OBJECT`.
 
     Args:
         reader: The dataset.
         shards: Which shards.
         skip: Whether to go on without shards that cannot be read.
+        objects: Ids to keep; empty keeps all.
 
     Raises:
         ShardError: One cannot be read and `skip` is off.
@@ -98,11 +102,14 @@ def read_scenes(
     scenes, bad = {}, {}
     for shard in shards:
         try:
-            scenes[shard] = reader.read(shard, ["scene_index"])["scene_index"]
+            read = reader.read(shard, ["scene_index", "obj_id"] if objects else ["scene_index"])
         except ShardError as error:
             if not skip:
                 raise
             bad[shard] = str(error)
+            continue
+        index = read["scene_index"].astype(np.int64)
+        scenes[shard] = np.where(np.isin(read["obj_id"], objects), index, OTHER_OBJECT) if objects else index
     return scenes, bad
 
 
@@ -114,7 +121,7 @@ def held_out_scenes(url: str, scene_of: Mapping[int, Array], share: float, seed:
     """
     if not scene_of:
         raise ShardError(f"{url}: no finished shard; let `synthgen render` write one first, or wait with --follow")
-    scenes = np.unique(np.concatenate(list(scene_of.values())))
+    scenes = _scenes(scene_of)
     if len(scenes) < 2:
         raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
     held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
@@ -123,14 +130,22 @@ def held_out_scenes(url: str, scene_of: Mapping[int, Array], share: float, seed:
 
 def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tuple[Split, Split]:
     """Samples for training and for validation."""
-    scenes = np.unique(np.concatenate(list(scene_of.values())))
-    held = np.isin(scenes, held_out)
+    held = np.isin(_scenes(scene_of), held_out)
 
     def side(inside: bool) -> Split:
-        rows = {s: np.flatnonzero(np.isin(index, held_out) == inside) for s, index in scene_of.items()}
+        rows = {
+            s: np.flatnonzero((index != OTHER_OBJECT) & (np.isin(index, held_out) == inside))
+            for s, index in scene_of.items()
+        }
         return Split(rows={s: r for s, r in rows.items() if len(r)}, scenes=int((held == inside).sum()))
 
     return side(False), side(True)
+
+
+def _scenes(scene_of: Mapping[int, Array]) -> Array:
+    """Numbers of the scenes that samples belong to."""
+    found = np.unique(np.concatenate(list(scene_of.values())))
+    return np.asarray(found[found != OTHER_OBJECT])
 
 
 def split_by_scene(reader: ShardReader, validation_share: float, seed: int) -> tuple[Split, Split]:
@@ -164,11 +179,13 @@ class Growth:
         out: Folder of the run, the same for all its processes.
         record: What the run began with.
         skip_bad_shards: Whether a new shard that cannot be read is left for a later epoch, or an error.
+        objects: Ids to train on; empty takes all.
     """
 
     out: Path
     record: DataRecord
     skip_bad_shards: bool = False
+    objects: tuple[int, ...] = ()
 
     def epochs(self, url: str) -> Iterator[dict[int, Array]]:
         """Training rows by shard that join at each epoch from epoch 1 on, until the dataset is complete.
@@ -189,9 +206,10 @@ class Growth:
             found = json.loads(path.read_text())
             if set(found["shards"]) - {*reader.committed}:
                 reader.refresh()
-            scene_of, _ = read_scenes(reader, found["shards"], skip=self.skip_bad_shards)
+            scene_of, _ = read_scenes(reader, found["shards"], skip=self.skip_bad_shards, objects=self.objects)
             known |= set(scene_of)
-            yield {s: np.flatnonzero(~np.isin(index, self.record.held_out)) for s, index in scene_of.items()}
+            held_out = (*self.record.held_out, OTHER_OBJECT)
+            yield {s: np.flatnonzero(~np.isin(index, held_out)) for s, index in scene_of.items()}
             if found["complete"]:
                 return
 

@@ -26,7 +26,7 @@ from refinenet.geometry import PoseUpdate
 from refinenet.inputs import mesh_digest
 from refinenet.loss import make_loss
 from refinenet.network import Pair, PaperNet, make_network
-from refinenet.objects import load_meshes, load_models, object_points
+from refinenet.objects import load_meshes, load_models, object_ids, object_points
 from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 from refinenet.own_predictions import OwnPredictions
 from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows
@@ -88,6 +88,9 @@ class Trainer:
         self.skipped: dict[str, None] = {}
         last = self._last() if resume else None
         reader = ShardReader(url)
+        if unknown := set(config.objects) - {*object_ids(reader)}:
+            known = ", ".join(map(str, object_ids(reader)))
+            raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; correct objects")
         self.training, self.validation, self._record = self._split(reader, resume=resume)
         self._held_out = self._make_held_out()
         meshes = load_meshes(reader)
@@ -96,7 +99,9 @@ class Trainer:
         self.objects = points.to(self.device)
         self._dataset_sha256 = _dataset_sha256(reader, config)
         self._objects_card = {
-            key: {**card, "mesh_digest": mesh_digest(meshes[int(key)])} for key, card in reader.card["objects"].items()
+            key: {**card, "mesh_digest": mesh_digest(meshes[int(key)])}
+            for key, card in reader.card["objects"].items()
+            if not config.objects or int(key) in config.objects
         }
         self._fx_px = float(reader.card.get("camera", {}).get("fx", 0.0))
         self.network = make_network(config.network).to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -140,7 +145,7 @@ class Trainer:
                 _wait_for_shards(reader, self.world * max(1, settings.workers))
             record = DataRecord.load(self.out) if resume else None
             begun = record.shards if record is not None else reader.committed
-            scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards)
+            scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards, objects=self.config.objects)
             self._tell_skipped(*bad.values())
             if record is None:
                 held = held_out_scenes(reader.url, scene_of, self.config.validation.scene_share, self.config.seed)
@@ -204,7 +209,9 @@ class Trainer:
         """Training batches on the device, from the present step on."""
         settings = self.config.loader
         workers = max(1, min(settings.workers, len(self.training.rows) // self.world))
-        growth = Growth(out=self.out, record=self._record, skip_bad_shards=settings.skip_bad_shards)
+        growth = Growth(
+            out=self.out, record=self._record, skip_bad_shards=settings.skip_bad_shards, objects=self.config.objects
+        )
         stream = PairStream(
             url=self._url, config=self.config, split=self.training, rank=self.rank, world=self.world, workers=workers,
             start=self.step * self.config.optimiser.accumulate, growth=growth if settings.follow else None,

@@ -30,6 +30,9 @@ log = logging.getLogger(__name__)
     "--set", "overrides", multiple=True, metavar="KEY=VALUE",
     help="Change one configuration key, e.g. --set optimiser.lr=1e-4. Repeatable; last wins.",
 )  # fmt: skip
+@click.option(
+    "--object", "objects", type=int, multiple=True, metavar="ID", help="Train on this object only. Repeatable. [all]"
+)
 @click.option("--steps", type=click.IntRange(1), help="Optimiser steps. [preset]")
 @click.option("--batch", type=click.IntRange(1), help="Pairs in a step. [preset]")
 @click.option("--loss", type=click.Choice(LOSSES), help="Loss. [preset]")
@@ -52,6 +55,7 @@ def train(
     preset: str,
     file: Path | None,
     overrides: tuple[str, ...],
+    objects: tuple[int, ...],
     backbone_weights: Path | None,
     init: Path | None,
     out: Path | None,
@@ -90,6 +94,7 @@ def train(
         "device": device, "loader.follow": follow or None, "loader.skip_bad_shards": skip_bad_shards or None,
         # quoted: a path may hold what YAML reads as a comment
         "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
+        "objects": list(objects) or None,
         "init": None if init is None else json.dumps(str(init)),
     }  # fmt: skip
     assigned = [*overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]

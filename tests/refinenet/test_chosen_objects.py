@@ -1,0 +1,72 @@
+"""Training on some of a dataset's objects."""
+
+import itertools
+import json
+
+import numpy as np
+import pytest
+from posecore.bop.models_info import save_models_info
+from posecore.errors import ConfigError
+from posecore.mesh import save_ply
+from posecore.shard import ShardReader, ShardWriter
+from refinenet.checkpoint import load
+from refinenet.split import OTHER_OBJECT, divide, held_out_scenes, read_scenes
+from refinenet.train import train
+from refinenet.trainer import Trainer
+
+from .test_train import small
+
+
+@pytest.fixture(scope="module")
+def two_objects(dataset, mesh, tmp_path_factory):
+    """The dataset with every second scene's object called 2."""
+    folder = tmp_path_factory.mktemp("two") / "shards"
+    reader = ShardReader(str(dataset))
+    card = {key: value for key, value in reader.card.items() if key not in ("schema", "schema_version")}
+    card["objects"] = {**card["objects"], "2": {**card["objects"]["1"], "path": "models/obj_000002.ply"}}
+    writer = ShardWriter.create(str(folder), card)
+    for obj_id in (1, 2):
+        save_ply(mesh, folder / f"models/obj_{obj_id:06d}.ply", units="mm")
+    save_models_info(folder / "models/models_info.json", {1: mesh, 2: mesh}, {})
+    for shard in reader.committed:
+        arrays = reader.read(shard)
+        arrays["obj_id"] = (1 + arrays["scene_index"] % 2).astype(np.int32)
+        writer.commit(writer.encode(shard, arrays))
+    return folder
+
+
+def test_only_the_chosen_objects_scenes_are_split(two_objects):
+    reader = ShardReader(str(two_objects))
+    scene_of, _ = read_scenes(reader, reader.committed, objects=(2,))
+    flat = np.concatenate(list(scene_of.values()))
+    assert set(flat) == {OTHER_OBJECT, *range(1, 24, 2)}
+    held_out = held_out_scenes(reader.url, scene_of, 0.25, 0)
+    assert len(held_out) == 3 and (held_out % 2 == 1).all()
+    training, validation = divide(scene_of, held_out)
+    assert (training.scenes, validation.scenes) == (9, 3)
+    assert (training.n, validation.n) == (18, 6)
+
+
+def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
+    config = small("objects=[2]", "batch=4", "steps=3", "loader.workers=0")
+    run = Trainer(config, str(two_objects), tmp_path / "look")
+    for batch in itertools.islice(run.stream(), 12):
+        assert (batch.target.object_index == 1).all()
+    assert all((batch.target.object_index == 1).all() for batch in run._held_out)
+    run.close()
+    train(config, str(two_objects), tmp_path / "run")
+    assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
+
+
+def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
+    train(small("objects=[1]", "batch=4", "steps=8", "loader.follow=true"), str(two_objects), tmp_path / "run")
+    held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
+    assert all(scene % 2 == 0 for scene in held_out)
+
+
+def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):
+    with pytest.raises(ConfigError, match="there is no object 7 in it, only 1, 2"):
+        Trainer(small("objects=[1, 7]"), str(two_objects), tmp_path / "run")
+    result = cli("train", two_objects, "--object", 7, "--out", tmp_path / "run", "--quiet")
+    assert result.exit_code == 2
+    assert "there is no object 7" in result.stderr
