@@ -8,7 +8,7 @@ against 0.676 on the objects of Tejani et al., most of which are symmetric.
 Test images are other scenes; starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
 
   --smoke  16 training steps: a test of the plumbing
-  --small  preset compact with each loss, 2 000 rasterised pairs, 800 steps of 32, 60 images
+  --small  preset compact with each loss, 2 000 rasterised pairs, 3 000 steps of 32, 300 images
   --full   preset paper with each loss, 200 000 path-traced pairs, 100 000 steps, 1 000 images; a GPU
 
     python experiments/symmetric_loss.py --small
@@ -24,7 +24,7 @@ from experiments.common import BOBBIN, Comparison, Experiment, Inputs, compared,
 
 TRAINING = {
     "smoke": "--steps 16 --batch 8 --set validation.pairs=16 --threads 1",
-    "small": "--steps 800 --threads 1",
+    "small": "--steps 3000 --threads 1",
 }
 
 
@@ -39,7 +39,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             objects=f"--object {quoted(BOBBIN)} --models-info {quoted(info)}",
             scenes=f"--engine {'cycles' if full else 'raster'} {inputs.behind()}",
             pairs={"smoke": 128, "small": 2000, "full": 200_000}[size],
-            frames={"smoke": 2, "small": 60, "full": 1000}[size],
+            frames={"smoke": 2, "small": 300, "full": 1000}[size],
             networks={name: chosen[name] for name in losses},
             baselines=(),
             starts="--random-up-to 20 --random-translation 0.2",
@@ -54,7 +54,7 @@ EXPERIMENT = Experiment(
     paper={"VSS": "contour loss 0.817, MSE 0.676 (Tejani et al.)"},
     minutes={
         "smoke": "a minute on two CPU cores",
-        "small": "five minutes on two CPU cores",
+        "small": "a quarter of an hour on two CPU cores",
         "full": "half a day, most of it rendering; a GPU",
     },
     plan=plan,
