@@ -82,7 +82,9 @@ def networks(size: str, inputs: Inputs) -> dict[str, Network]:
     made |= {f"without-{name}": Network(train=f"{base} {settings(text)}", pairs=pairs) for name, text in off.items()}
     if size == "small":
         choices = " ".join(text for name, text in OFF.items() if name != "contour-loss")
-        made["paper-choices"] = Network(train=f"{base} {settings(choices)}", pairs=pairs)
+        # Fixed windows and stored hypotheses: the patches are taken as they are rendered.
+        as_they_are = "--set patch_px=64 --set hypotheses_per_scene=1"
+        made["paper-choices"] = Network(train=f"{base} {settings(choices)}", pairs=as_they_are)
     if size == "full":
         made["paper"] = Network(train=f"--preset paper {inputs.stem()}", pairs="--set hypotheses_per_scene=1")
     return made

@@ -38,8 +38,8 @@ def gradient_agreement(
         inside: Patch pixels that lie in the image.
     """
     outline = np.where(mask, np.float32(OUTLINE), np.float32(0))
-    render, strength = _gradients(np.concatenate([hypothesis_rgb.astype(np.float32), outline[..., None]], axis=-1))
-    scene, scene_strength = _gradients(scene_rgb.astype(np.float32))
+    render, strength = gradients(np.concatenate([hypothesis_rgb.astype(np.float32), outline[..., None]], axis=-1))
+    scene, scene_strength = gradients(scene_rgb.astype(np.float32))
     edges = (strength > RENDER_EDGE) & inside
     cosine = (render * scene).sum(axis=-1)
     agreement = (2 * cosine**2 - 1) * (edges & (scene_strength > SCENE_EDGE))
@@ -47,7 +47,7 @@ def gradient_agreement(
     return np.clip(mean, 0.0, 1.0).astype(np.float64)
 
 
-def _gradients(values: Float[Array, "b p p c"]) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:
+def gradients(values: Float[Array, "b p p c"]) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:
     """Unit direction (0 where flat) and strength of the gradient of the channel that changes most at each pixel."""
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
     across = padded[:, :, 2:] - padded[:, :, :-2]

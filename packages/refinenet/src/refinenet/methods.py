@@ -20,6 +20,7 @@ BASELINES: dict[str, str] = {
     "edge-icp": "refinenet.baselines.edge_icp:EdgeIcp",
     "depth-icp": "refinenet.baselines.depth_icp:DepthIcp",
     "region": "refinenet.baselines.region:RegionTracker",
+    "search": "refinenet.baselines.search:GradientSearch",
 }
 """By name of the method, `module:class` of a `PoseRefiner` that is made with `(meshes, iterations=...)`."""
 

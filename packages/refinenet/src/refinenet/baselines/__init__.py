@@ -1,1 +1,1 @@
-"""Refiners without a network, for comparison: edges, depth, colour regions."""
+"""Refiners without a network: edges, depth, colour regions, and a search that takes starts that are far off."""
