@@ -24,7 +24,7 @@ def rasteriser(mesh):
         yield opened
 
 
-def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, **hypothesis):
+def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, symmetries=None, **hypothesis):
     maker = PairMaker(
         meshes={1: mesh},
         rasteriser=rasteriser,
@@ -33,8 +33,25 @@ def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, **hypothe
         contour_points=32,
         hypothesis=HypothesisConfig(**hypothesis),
         augment_config=augment_config or AugmentConfig(),
+        symmetries=symmetries,
     )
     return maker(samples, [np.random.default_rng([seed, i]) for i in range(len(samples))])
+
+
+def test_hypotheses_start_at_any_pose_that_looks_like_the_truth(mesh, rasteriser, samples):
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    symmetries = {1: np.stack([np.eye(4), half_turn])}
+    drawn = {"fresh": True, "max_angle_deg": 10.0, "symmetries": symmetries}
+
+    def turned_deg(**more):
+        pairs = [make_pairs(mesh, rasteriser, samples, seed, **drawn, **more) for seed in range(4)]
+        changes = [p.T_cam_obj_hypothesis[:, :3, :3] @ p.T_cam_obj[:, :3, :3].swapaxes(1, 2) for p in pairs]
+        return np.rad2deg(se3.rotation_angle_rad(np.concatenate(changes)))
+
+    assert turned_deg().max() < 10.1
+    far = turned_deg(any_twin=True) > 165
+    assert 0.2 < far.mean() < 0.8
+    assert (turned_deg(any_twin=True)[~far] < 10.1).all()
 
 
 def test_recut_without_a_turn_is_the_cut_itself():

@@ -112,6 +112,8 @@ class HypothesisConfig:
             times as far in depth as across the image.
         easy_share: share of samples whose angle is scaled down at random, and of those whose distance is,
             independently: what the later iterations of a refinement see.
+        any_twin: draw around any of the poses that look like the truth, where the object has symmetries, as detectors
+            give them. Which one it was cannot be seen; `mse` asks for it all the same, the other losses do not.
         in_plane: turn each scene about the optical axis by a random angle.
     """
 
@@ -120,6 +122,7 @@ class HypothesisConfig:
     max_translation_diameter: float = 0.2
     depth_stretch: float = 1.0
     easy_share: float = 0.3
+    any_twin: bool = False
     in_plane: bool = True
 
     def __post_init__(self) -> None:

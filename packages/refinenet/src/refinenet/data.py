@@ -24,7 +24,7 @@ from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
-from refinenet.objects import for_patches, load_meshes
+from refinenet.objects import for_patches, load_meshes, load_models, symmetries_of
 from refinenet.recut import fixed_sides_px
 from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
@@ -85,6 +85,7 @@ class PairSource:
                 contour_points=config.loss.contour_points,
                 hypothesis=config.hypothesis if training else _steady(config),
                 augment_config=self._augment,
+                symmetries=symmetries_of(meshes, load_models(self.reader), config.loss.symmetry_step_deg),
             )
 
     def close(self) -> None:

@@ -119,6 +119,7 @@ class PairMaker:
         contour_points: Contour points of each patch.
         hypothesis: How hypotheses are drawn; with `fresh` off, the stored ones are taken.
         augment_config: Colour augmentation.
+        symmetries: Transforms of each object that leave it as it is, for `hypothesis.any_twin`.
     """
 
     def __init__(
@@ -132,6 +133,7 @@ class PairMaker:
         hypothesis: HypothesisConfig,
         augment_config: AugmentConfig,
         fixed_sides_px: Mapping[int, float] | None = None,
+        symmetries: Mapping[int, Float[Array, "s 4 4"]] | None = None,
     ) -> None:
         self._meshes = meshes
         self._rasteriser = rasteriser
@@ -141,6 +143,7 @@ class PairMaker:
         self._contour_points = contour_points
         self._hypothesis = hypothesis
         self._augment = augment_config
+        self._symmetries = dict(symmetries or {})
 
     def __call__(self, samples: Sequence[Mapping[str, Any]], rngs: Sequence[np.random.Generator]) -> PairArrays | None:
         """Pairs of these samples, each drawn with its own generator; None when no object can be seen in any of them.
@@ -195,7 +198,8 @@ class PairMaker:
         stored, stored_px = Window(x0_px=x0, y0_px=y0, side_px=side), len(sample["scene_rgb"])
         for attempt in range(ATTEMPTS):
             if self._hypothesis.fresh:
-                guess = draw_hypothesis(truth, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
+                around = self._twin(truth, int(sample["obj_id"]), rng) if self._hypothesis.any_twin else truth
+                guess = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
             else:
                 guess = T_turn @ sample["T_cam_obj_hypothesis"]
             if (guess[:3, :3] @ mesh.center_m + guess[:3, 3])[2] < mesh.diameter_m:
@@ -221,6 +225,11 @@ class PairMaker:
                     valid=valid,
                 )
         return None
+
+    def _twin(self, truth: Float[Array, "4 4"], obj_id: int, rng: np.random.Generator) -> Float[Array, "4 4"]:
+        """One of the poses that look like the truth."""
+        transforms = self._symmetries.get(obj_id)
+        return truth if transforms is None else np.asarray(truth @ transforms[rng.integers(len(transforms))])
 
     def _render(self, drafts: Sequence[_Draft]) -> tuple[UInt8[Array, "b p p 3"], Float[Array, "b p p"]]:
         p = self._patch_px

@@ -55,6 +55,24 @@ def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
         return load_models_info(copy)
 
 
+def symmetries_of(
+    meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], step_deg: float
+) -> dict[int, np.ndarray]:
+    """(s, 4, 4) transforms that leave each object as it is, the identity first, by object id.
+
+    Args:
+        meshes: By object id.
+        models: Symmetries by object id; an object that is not there has none.
+        step_deg: Step at which continuous symmetries are sampled.
+    """
+    found = {}
+    for obj_id in meshes:
+        known = models.get(obj_id)
+        identity = np.eye(4)[None]
+        found[obj_id] = identity if known is None else symmetry_transforms(known, max_step_rad=np.deg2rad(step_deg))
+    return found
+
+
 def object_points(
     meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], n_points: int, step_deg: float
 ) -> ObjectPoints:
@@ -66,12 +84,8 @@ def object_points(
         n_points: Points of each object.
         step_deg: Step at which continuous symmetries are sampled.
     """
-    points, transforms = [], []
-    for obj_id, mesh in sorted(meshes.items()):
-        points.append(farthest_points(mesh.vertices_m, n_points))
-        known = models.get(obj_id)
-        identity = np.eye(4)[None]
-        transforms.append(identity if known is None else symmetry_transforms(known, max_step_rad=np.deg2rad(step_deg)))
+    points = [farthest_points(mesh.vertices_m, n_points) for _, mesh in sorted(meshes.items())]
+    transforms = [S for _, S in sorted(symmetries_of(meshes, models, step_deg).items())]
     width = max(len(S) for S in transforms)
     padded = [np.concatenate([S, np.tile(np.eye(4), (width - len(S), 1, 1))]) for S in transforms]
     valid = np.stack([np.arange(width) < len(S) for S in transforms])
