@@ -38,13 +38,13 @@ def errors(name, ply, seeds):
 
 
 def test_far_starts_come_back(shared_data):
-    """When this was written all 12 did, and 5 with edge ICP alone."""
+    """Of 12 frames (seeds 0 to 5) all did when this was written, and 5 with edge ICP alone."""
     plys = [shared_data / f"lmo/models/obj_{obj_id:06d}.ply" for obj_id in LMO_OBJECTS]
-    by_search = np.concatenate([errors("search", ply, range(6)) for ply in plys])
-    by_edges = np.concatenate([errors("edge-icp", ply, range(6)) for ply in plys])
+    by_search = np.concatenate([errors("search", ply, range(3)) for ply in plys])
+    by_edges = np.concatenate([errors("edge-icp", ply, range(3)) for ply in plys])
     assert by_search[:, 0].min() > 0.1  # none starts there
-    assert (by_search[:, 1] < 0.1).sum() >= 10
-    assert (by_edges[:, 1] < 0.1).sum() <= 7
+    assert (by_search[:, 1] < 0.1).sum() >= 5
+    assert (by_edges[:, 1] < 0.1).sum() <= 3
 
 
 @pytest.fixture(scope="module")

@@ -89,6 +89,7 @@ def refine(
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out results/refined.csv
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out ten.csv --iterations 10
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out pool.csv --hypotheses 16
+    refinenet refine --method search --dataset lmo --init start.csv --out searched.csv
     """
     start_logging(verbose)
     require_fit(method, checkpoint)
