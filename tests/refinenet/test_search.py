@@ -1,5 +1,7 @@
 """Search by gradients: it comes back from starts that are too far off for anything that follows them downhill."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from posecore import se3
@@ -100,13 +102,19 @@ def test_edges_count_without_their_sign_and_not_across(seen):
     assert along.max() == 0
 
 
-def test_moves_across_and_along_the_ray(tug):
+def test_moves_are_about_the_centre_across_and_along_the_ray(tug):
+    off_origin = replace(tug, vertices_m=tug.vertices_m + np.array([0.5, -1.0, 2.0]))  # as exported from an assembly
     start = se3.make_T(se3.random_rotation(np.random.default_rng(0)), np.array([0.1, -0.05, 0.7]))
-    moves = np.zeros((3, 6))
+    start[:3, 3] -= start[:3, :3] @ off_origin.center_m
+    moves = np.zeros((4, 6))
     moves[1, 5] = 0.1
     moves[2, 3] = 0.2
-    same, farther, aside = moved_by(start, moves, tug.diameter_m)
-    np.testing.assert_allclose(same, start, atol=1e-12)
-    assert farther[2, 3] == pytest.approx(0.7 * np.exp(0.1))
-    np.testing.assert_allclose(project(K, farther[None, :3, 3]), project(K, start[None, :3, 3]), atol=1e-9)
-    np.testing.assert_allclose(aside[:3, 3] - start[:3, 3], [0.2 * tug.diameter_m, 0, 0], atol=1e-12)
+    moves[3, 1] = 0.5
+    T = moved_by(start, moves, off_origin)
+    same, farther, aside, turned = se3.apply(T, off_origin.center_m[None])[:, 0]
+    np.testing.assert_allclose(T[0], start, atol=1e-12)
+    np.testing.assert_allclose(farther, np.exp(0.1) * same, atol=1e-12)
+    np.testing.assert_allclose(project(K, farther[None]), project(K, same[None]), atol=1e-9)
+    np.testing.assert_allclose(aside - same, [0.2 * tug.diameter_m, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(turned, same, atol=1e-12)
+    assert se3.rotation_angle_rad(T[3, :3, :3] @ start[:3, :3].T) == pytest.approx(0.5)

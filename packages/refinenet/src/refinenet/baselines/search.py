@@ -98,32 +98,27 @@ class GradientSearch(Baseline):
     def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
         start = np.ascontiguousarray(T_cam_obj, np.float64)
         rng = np.random.default_rng([target.obj_id, zlib.crc32(start.tobytes())])
-        best: Refinement | None = None
-        done = 0
+        if look(frame.image, frame.K, start, target, STAGES[0].patch_px) is None:
+            return failed(T_cam_obj, 0, "the start pose shows nothing of the object in the image")
+        best, done = failed(T_cam_obj, 0, ""), 0
         for _ in range(TRIES):
             found = self._try(frame, start, target, rng)
-            if found is None:
-                return failed(T_cam_obj, done, "the start pose shows nothing of the object in the image")
             done += found.iterations
-            if best is None or _confidence(found) > _confidence(best):
-                best = found
+            best = max(best, found, key=_confidence)
             if _confidence(best) >= ENOUGH_AGREEMENT:
                 break
-        assert best is not None
         if _confidence(best) < MIN_AGREEMENT:
             why = f"gradients agree with the image's by {_confidence(best):.2f} at most, {MIN_AGREEMENT} needed"
             return failed(T_cam_obj, done, why)
         return replace(best, iterations=done)
 
-    def _try(
-        self, frame: Frame, start: Float[Array, "4 4"], target: Target, rng: np.random.Generator
-    ) -> Refinement | None:
-        """What one search finds; None where the start shows nothing."""
+    def _try(self, frame: Frame, start: Float[Array, "4 4"], target: Target, rng: np.random.Generator) -> Refinement:
+        """What one search finds."""
         pose, rounds = start, 0
         for stage in STAGES:
             view = look(frame.image, frame.K, pose, target, stage.patch_px)
-            if view is None:
-                return None
+            if view is None:  # the stage before went astray, which its agreement will tell
+                break
             pose = search(view, pose, target, self._quick, stage, rng)
             rounds += len(stage.spread_px)
         by_edges = refine_by_edges(frame.image, frame.K, pose, target, self.iterations)
@@ -172,21 +167,22 @@ def search(
         drawn = stage.drawn * (2 if number == 0 else 1)
         around = best[rng.integers(len(best), size=drawn)]
         moves = np.concatenate([best, around + rng.normal(size=(drawn, 6)) * sigma * stage.shrink**number])
-        T = moved_by(start, moves, target.mesh.diameter_m)
+        T = moved_by(start, moves, target.mesh)
         layers = rasteriser.render(target.obj_id, view.K, T, stage.patch_px, stage.patch_px)
         assert layers.rgb is not None
         agreement = edge_agreement(layers.rgb, layers.mask, view.in_image, responses[spread])
         score = agreement - stage.leash * np.square(moves / sigma).sum(axis=1)
         best = moves[np.argsort(-score, kind="stable")[: stage.kept]]
-    return np.asarray(moved_by(start, best[:1], target.mesh.diameter_m)[0])
+    return np.asarray(moved_by(start, best[:1], target.mesh)[0])
 
 
-def moved_by(start: Float[Array, "4 4"], moves: Float[Array, "n 6"], diameter_m: float) -> Float[Array, "n 4 4"]:
-    """Poses turned in camera axes about the object's origin, moved across the image (diameters) and in depth (log)."""
-    z = start[2, 3] * np.exp(moves[:, 5])
-    xy = (start[:2, 3] + diameter_m * moves[:, 3:5]) * (z / start[2, 3])[:, None]
+def moved_by(start: Float[Array, "4 4"], moves: Float[Array, "n 6"], mesh: Mesh) -> Float[Array, "n 4 4"]:
+    """Poses turned in camera axes about the mesh's centre, moved across the image (diameters) and in depth (log)."""
+    centre_m = start[:3, :3] @ mesh.center_m + start[:3, 3]
+    across_m = np.pad(mesh.diameter_m * moves[:, 3:5], ((0, 0), (0, 1)))
     R = se3.rotation_from_rotvec(moves[:, :3]) @ start[:3, :3]
-    return se3.make_T(R, np.concatenate([xy, z[:, None]], axis=1))
+    t = np.exp(moves[:, 5:]) * (centre_m + across_m) - R @ mesh.center_m
+    return se3.make_T(R, t)
 
 
 def response_maps(view: View, spread_px: int) -> Float[Array, "o p p"]:
