@@ -14,7 +14,8 @@ Every network sees the same pairs in the same order for the same number of steps
   background, occlusion, colour   that augmentation is off
   average          the weights themselves instead of their running average
 
-`--small` has `paper-choices` beside them: every switch off at once, as in the paper, with the same network.
+`--small` has `paper-choices` beside them: every switch off at once, as in the paper, with the same network. Its
+pairs are rendered as that network takes them, with the renderer's own hypotheses.
 
 Test images are other scenes; starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
 

@@ -68,7 +68,7 @@ EXPERIMENT = Experiment(
     paper={"unseen members": "tracked, without figures"},
     minutes={
         "smoke": "two minutes on two CPU cores",
-        "small": "ten minutes on two CPU cores",
+        "small": "a quarter of an hour on two CPU cores",
         "full": "a day, most of it rendering; a GPU",
     },
     plan=plan,

@@ -91,7 +91,7 @@ EXPERIMENT = Experiment(
     },
     minutes={
         "smoke": "a few minutes on two CPU cores",
-        "small": "under an hour on two CPU cores",
+        "small": "an hour and a half on two CPU cores",
         "full": "days, most of them rendering; a GPU",
     },
     plan=plan,

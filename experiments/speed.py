@@ -57,7 +57,7 @@ EXPERIMENT = Experiment(
     paper={"one iteration": "about 25 ms on a GTX 1080"},
     minutes={
         "smoke": "half a minute on two CPU cores",
-        "small": "three minutes on two CPU cores",
+        "small": "six minutes on two CPU cores",
         "full": "ten minutes; a GPU",
     },
     plan=plan,

@@ -26,7 +26,17 @@ def dense():
     )
 
 
-def test_a_mesh_with_fewer_faces_looks_the_same(dense):
+@pytest.mark.parametrize("soup", [False, True], ids=["shared vertices", "three vertices a face, as in STL files"])
+def test_a_mesh_with_fewer_faces_looks_the_same(dense, soup):
+    if soup:
+        corners = dense.faces.reshape(-1)
+        dense = replace(
+            dense,
+            vertices_m=dense.vertices_m[corners],
+            faces=np.arange(len(corners), dtype=np.int32).reshape(-1, 3),
+            normals=dense.normals[corners],
+            vertex_rgb=dense.vertex_rgb[corners],
+        )
     few, side_px = simplified(dense, 64**2), 64
     assert len(few.faces) <= 1.01 * 64**2
     assert few.is_closed

@@ -10,7 +10,7 @@ from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
 from refinenet.checkpoint import load
-from refinenet.split import OTHER_OBJECT, divide, held_out_scenes, read_scenes
+from refinenet.split import OTHER_OBJECT, DataRecord, Growth, divide, held_out_scenes, read_scenes
 from refinenet.train import train
 from refinenet.trainer import Trainer
 
@@ -59,9 +59,20 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
 
 
 def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
-    train(small("objects=[1]", "batch=4", "steps=8", "loader.follow=true"), str(two_objects), tmp_path / "run")
+    config = small("objects=[1]", "batch=4", "steps=8", "loader.follow=true", "loader.workers=0")
+    train(config, str(two_objects), tmp_path / "run")
     held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
     assert all(scene % 2 == 0 for scene in held_out)
+    # A run that began with two shards: the others join in its second epoch.
+    (tmp_path / "grown").mkdir()
+    record = DataRecord(shards=(0, 1), held_out=(0,))
+    growth = Growth(out=tmp_path / "grown", record=record, objects=(1,))
+    joined = next(growth.epochs(str(two_objects)))
+    reader = ShardReader(str(two_objects))
+    assert set(joined) == {*reader.committed} - {0, 1}
+    for shard, rows in joined.items():
+        assert len(rows) == 4
+        assert (reader.read(shard, ["obj_id"])["obj_id"][rows] == 1).all()
 
 
 def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):

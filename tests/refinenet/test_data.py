@@ -2,10 +2,13 @@ import itertools
 import json
 import shutil
 
+import numpy as np
 import pytest
 import torch
+from posecore.bop.models_info import ModelInfo, save_models_info
 from posecore.errors import ConfigError, ShardError
 from posecore.shard import ShardReader
+from refinenet import geometry
 from refinenet.config import load_config
 from refinenet.data import PairStream, make_loader
 from refinenet.split import split_by_scene, spread_rows
@@ -133,3 +136,17 @@ def test_another_schema_and_no_dataset_are_errors(dataset, tmp_path):
     (copy / "zarr.json").write_text(json.dumps(group))
     with pytest.raises(ShardError, match="schema posepair version 99"):
         ShardReader(str(copy))
+
+
+def test_any_twin_takes_the_symmetries_that_the_dataset_carries(dataset, mesh, training, tmp_path):
+    copy = shutil.copytree(dataset, tmp_path / "symmetric")
+    info = ModelInfo(diameter_m=mesh.diameter_m, symmetries_discrete=(np.diag([-1.0, -1.0, 1.0, 1.0]),))
+    save_models_info(copy / "models" / "models_info.json", {1: mesh}, {1: info})
+
+    def turned_deg(*overrides):
+        batches = take(make_stream(copy, training, ["hypothesis.max_angle_deg=10", *overrides]), 4)
+        changes = [geometry.update_between(b.target.T_cam_obj, b.target.T_cam_obj_hypothesis).dR for b in batches]
+        return geometry.rotation_angle_deg(torch.cat(changes))
+
+    assert turned_deg().max() < 11
+    assert (turned_deg("hypothesis.any_twin=true") > 165).any()

@@ -25,8 +25,13 @@ def simplified(mesh: Mesh, max_faces: int) -> Mesh:
     """
     if len(mesh.faces) <= max_faces or mesh.texture_rgb is not None:
         return mesh
+    # Vertices at one place count as one: of triangles that hang together in nothing, whole ones would be dropped.
+    _, first, place = np.unique(mesh.vertices_m.round(9), axis=0, return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))  # the order of the file, which the result depends on
     vertices_m, faces = fast_simplification.simplify(
-        mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32), target_count=max_faces
+        mesh.vertices_m[np.sort(first)].astype(np.float32),
+        rank[place.reshape(-1)][mesh.faces].astype(np.int32),
+        target_count=max_faces,
     )
     nearest = cKDTree(mesh.vertices_m).query(vertices_m)[1]
     return replace(

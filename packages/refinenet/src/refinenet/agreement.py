@@ -37,14 +37,21 @@ def gradient_agreement(
         mask: Their silhouettes.
         inside: Patch pixels that lie in the image.
     """
-    outline = np.where(mask, np.float32(OUTLINE), np.float32(0))
-    render, strength = gradients(np.concatenate([hypothesis_rgb.astype(np.float32), outline[..., None]], axis=-1))
+    render, strength = render_gradients(hypothesis_rgb, mask)
     scene, scene_strength = gradients(scene_rgb.astype(np.float32))
     edges = (strength > RENDER_EDGE) & inside
     cosine = (render * scene).sum(axis=-1)
     agreement = (2 * cosine**2 - 1) * (edges & (scene_strength > SCENE_EDGE))
     mean = agreement.sum(axis=(1, 2)) / np.maximum(edges.sum(axis=(1, 2)), 1)
     return np.clip(mean, 0.0, 1.0).astype(np.float64)
+
+
+def render_gradients(
+    rgb: UInt8[Array, "b p p 3"], mask: Bool[Array, "b p p"]
+) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:
+    """`gradients` of renders on black, whose silhouettes count as edges whatever the object's colour."""
+    outline = np.where(mask, np.float32(OUTLINE), np.float32(0))
+    return gradients(np.concatenate([rgb.astype(np.float32), outline[..., None]], axis=-1))
 
 
 def gradients(values: Float[Array, "b p p c"]) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:

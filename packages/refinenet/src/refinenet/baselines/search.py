@@ -18,7 +18,7 @@ from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.simplify import simplified
 
-from refinenet.agreement import OUTLINE, RENDER_EDGE, SCENE_EDGE, gradient_agreement, gradients
+from refinenet.agreement import RENDER_EDGE, SCENE_EDGE, gradient_agreement, gradients, render_gradients
 from refinenet.baselines.edge_icp import refine_by_edges
 from refinenet.baselines.outcome import Baseline, failed
 from refinenet.baselines.view import Target, View, look
@@ -33,7 +33,7 @@ MIN_EDGE_PX = 20
 MIN_AGREEMENT = 0.1
 """Of gradients in the end, below which nothing was found."""
 ENOUGH_AGREEMENT = 0.55
-"""Below this the search is made again, with other draws: of rendered poses that end above it four in five are right."""
+"""Below this the search is made again, with other draws. Most rendered poses that end above it are right, few below."""
 TRIES = 3
 
 
@@ -205,8 +205,7 @@ def edge_agreement(
     responses: Float[Array, "o p p"],
 ) -> Float[Array, " n"]:
     """Mean response at the edges of renders, silhouettes included."""
-    outline = np.where(mask, np.float32(OUTLINE), np.float32(0))
-    unit, strength = gradients(np.concatenate([rgb.astype(np.float32), outline[..., None]], axis=-1))
+    unit, strength = render_gradients(rgb, mask)
     n, row, column = np.nonzero((strength > RENDER_EDGE) & in_image)
     doubled = _doubled(unit[n, row, column])
     turn = np.arctan2(doubled[:, 1], doubled[:, 0]) / (2 * np.pi)
