@@ -90,7 +90,7 @@ class Trainer:
         reader = ShardReader(url)
         if unknown := set(config.objects) - {*object_ids(reader)}:
             known = ", ".join(map(str, object_ids(reader)))
-            raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; correct objects")
+            raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; choose among those")
         self.training, self.validation, self._record = self._split(reader, resume=resume)
         self._held_out = self._make_held_out()
         meshes = load_meshes(reader)
