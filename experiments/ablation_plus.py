@@ -114,7 +114,7 @@ EXPERIMENT = Experiment(
     paper={"ablation of these switches": "none; method.md, preset plus, has the evidence they were chosen by"},
     minutes={
         "smoke": "two minutes on two CPU cores",
-        "small": "an hour and a half on two CPU cores",
+        "small": "an hour and a quarter on two CPU cores",
         "full": "a day; a GPU",
     },
     plan=plan,

@@ -65,7 +65,7 @@ EXPERIMENT = Experiment(
     paper={"VSS": "contour loss 0.817, MSE 0.676 (RGB-D tracker 0.627, region tracker 0.304)"},
     minutes={
         "smoke": "two minutes on two CPU cores",
-        "small": "half an hour on two CPU cores",
+        "small": "a quarter of an hour on two CPU cores",
         "full": "a day, most of it rendering; a GPU",
     },
     plan=plan,
