@@ -322,6 +322,8 @@ def run(experiment: Experiment) -> int:
     parser.add_argument("--list", action="store_true", help="show the commands and run none")
     chosen = parser.parse_args()
     work = (chosen.work or Path(f"experiment-{experiment.name}-{chosen.size}")).resolve()
+    if work.exists() and not work.is_dir():
+        raise SystemExit(f"Error: {work}: is a file, expected a folder to work in; name another")
     given = {name: getattr(chosen, name) for name in ("data", "backbone_weights", "backgrounds")}
     for name, path in given.items():
         if path is not None and not path.exists():

@@ -167,6 +167,15 @@ def test_meshes_that_are_missing_are_said(tmp_path) -> None:
         experiment("perturbation_curves").plan(tmp_path, "full", common.Inputs(data=tmp_path))
 
 
+def test_a_file_to_work_in_is_refused(tmp_path, monkeypatch) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("kept")
+    monkeypatch.setattr(sys, "argv", ["speed.py", "--smoke", str(file)])
+    with pytest.raises(SystemExit, match=r"notes\.txt: is a file, expected a folder to work in"):
+        common.run(experiment("speed"))
+    assert file.read_text() == "kept"
+
+
 @pytest.mark.slow
 def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     script = ROOT / "experiments" / "perturbation_curves.py"

@@ -336,6 +336,8 @@ def test_meshes_with_any_bytes(tmp_path, original, change):
         (b"\n30 20 15\n", b"\n\n30 20 15\n", "the vertex has 0 numbers, its header says 3"),
         (b"3 1 7 3\n", b"3 1 7.9 3\n", "names a vertex by something that is no whole number"),
         (b"3 1 7 3\n", b"2 1 7 3\n", "the face has 4 numbers, its header says 3"),
+        pytest.param(b"3 1 7 3\n", b"9" * 5000 + b" 1 7 3\n", "has no count of its list", id="endless count"),
+        pytest.param(ascii_ply()[-120:], b"", "of 'vertex', its header says 8; the file is cut off", id="cut"),
     ],
 )
 def test_an_ascii_mesh_that_a_lenient_reader_would_take_is_refused(tmp_path, before, after, said):
@@ -345,7 +347,7 @@ def test_an_ascii_mesh_that_a_lenient_reader_would_take_is_refused(tmp_path, bef
     file.write_bytes(ascii_ply().replace(before, after))
     with pytest.raises(MeshError) as caught:
         load_mesh(file)
-    assert said in str(caught.value) or "cannot be read as a mesh" in str(caught.value)
+    assert said in str(caught.value)
 
 
 line = st.sampled_from(

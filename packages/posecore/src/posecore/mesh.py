@@ -135,9 +135,9 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
     data = file.read_bytes()
     if not data:
         raise MeshError(f"{file}: the file is empty (0 bytes), expected a mesh; export it again")
-    geometry = _read(file)
     if file.suffix.lower() == ".ply":
         refuse_broken_ply(file, data)
+    geometry = _read(file)
     vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
     if not np.isfinite(vertices).all():
         bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])

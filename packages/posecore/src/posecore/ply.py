@@ -8,6 +8,7 @@ from posecore.errors import MeshError
 
 _NO_NUMBERS = (b"nan", b"inf", b"infinity")  # refused with the vertex they are in
 _NUMBER_CHARACTERS = b"0123456789+-.eE \t\r\n"
+_MOST_DIGITS = 18  # of a count
 
 
 @dataclass(kw_only=True)
@@ -54,7 +55,7 @@ def _elements(lines: list[str]) -> Iterator[_Element]:
     element: _Element | None = None
     for line in lines:
         words = line.split()
-        if len(words) == 3 and words[0] == "element" and words[2].isdigit():
+        if len(words) == 3 and words[0] == "element" and _is_count(words[2]):
             if element is not None:
                 yield element
             element = _Element(name=words[1], count=int(words[2]))
@@ -78,7 +79,7 @@ def _wrong_row(text: bytes, element: _Element) -> str:
         if not is_list:
             position += 1
             continue
-        if position >= len(words) or not words[position].isdigit():
+        if position >= len(words) or not _is_count(words[position]):
             return "has no count of its list"
         size = int(words[position])
         inside = words[position + 1 : position + 1 + size]
@@ -86,6 +87,10 @@ def _wrong_row(text: bytes, element: _Element) -> str:
             return "names a vertex by something that is no whole number"
         position += 1 + size
     return "" if position == len(words) else f"has {len(words)} numbers, its header says {position}"
+
+
+def _is_count(word: str | bytes) -> bool:
+    return word.isdigit() and len(word) <= _MOST_DIGITS
 
 
 def _is_number(word: bytes) -> bool:
