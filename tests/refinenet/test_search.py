@@ -8,7 +8,17 @@ from posecore import se3
 from posecore.camera import project
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
-from refinenet.baselines.search import STAGES, edge_agreement, moved_by, response_maps
+from refinenet.baselines.search import (
+    APART,
+    CANDIDATES,
+    PATCH_PX,
+    ROUNDS,
+    WINDOW_SCALE,
+    moved_by,
+    response_maps,
+    search,
+)
+from refinenet.baselines.sparse_views import sparse_views
 from refinenet.baselines.view import Target, look
 from refinenet.methods import Request, Status, make_baseline
 
@@ -56,15 +66,11 @@ def tug(tug_ply):
 
 @pytest.fixture(scope="module")
 def seen(tug):
-    """A frame with the tug, its pose, and the pose looked at."""
+    """A frame with the tug, its pose, the pose looked at, and the tug's edges."""
     with Rasteriser({1: tug}) as rasteriser:
         frame, truth = rendered_frame(tug, rasteriser, 1)
-        yield (
-            frame,
-            truth,
-            look(frame.image, frame.K, truth, Target(obj_id=1, mesh=tug, rasteriser=rasteriser), 64),
-            rasteriser,
-        )
+        view = look(frame.image, frame.K, truth, Target(obj_id=1, mesh=tug, rasteriser=rasteriser), 64)
+        yield frame, truth, view, sparse_views(1, tug, rasteriser)
 
 
 def test_the_result_depends_on_image_and_start_alone(tug, seen):
@@ -77,19 +83,66 @@ def test_the_result_depends_on_image_and_start_alone(tug, seen):
     np.testing.assert_array_equal(together[1].T_cam_obj, alone.T_cam_obj)
     assert together[1].confidence == alone.confidence
     assert alone.status in (Status.CONVERGED, Status.STOPPED)
-    assert alone.iterations >= sum(len(stage.spread_px) for stage in STAGES)
+    assert alone.iterations >= len(ROUNDS)
 
 
 def test_the_truth_agrees_best(tug, seen):
-    _, truth, view, rasteriser = seen
+    _, truth, view, views = seen
     rng = np.random.default_rng(0)
     near = [se3.perturb(truth, np.deg2rad(12), 0.08 * tug.diameter_m, rng) for _ in range(30)]
-    layers = rasteriser.render(1, view.K, np.stack([truth, *near]), 64, 64)
-    sharp, spread = (edge_agreement(layers.rgb, layers.mask, view.in_image, response_maps(view, px)) for px in (0, 4))
+    sharp, spread = (
+        views.agreement(np.stack([truth, *near]), view.K, view.in_image, response_maps(view, px)) for px in (1, 4)
+    )
+    assert sharp[0] > 0.8
     assert sharp[0] > sharp[1:].max()
     assert (spread >= sharp).all()
     # What is seen from further away falls off more slowly.
     assert np.median(spread[1:]) / spread[0] > np.median(sharp[1:]) / sharp[0]
+
+
+def test_edges_from_any_viewpoint_lie_where_a_render_has_them(tug, seen):
+    """Response maps of the render itself, one pixel wide: nearly every edge of the nearest viewpoint finds its own."""
+    _, _, around, views = seen
+    K = np.array([[300.0, 0, 32], [0, 280.0, 32], [0, 0, 1]])  # pixels that are not square
+    everywhere = np.ones((64, 64), bool)
+    agreement = []
+    with Rasteriser({1: tug}) as rasteriser:
+        for seed in range(8):
+            R = se3.random_rotation(np.random.default_rng(seed))
+            T = se3.make_T(R, np.array([0.01, -0.01, 5.0 * tug.diameter_m]) - R @ tug.center_m)
+            rgb = rasteriser.render(1, K, T[None], 64, 64).rgb[0]
+            view = replace(around, scene_rgb=rgb, in_image=everywhere)
+            agreement.append(views.agreement(T[None], K, everywhere, response_maps(view, 1))[0])
+    assert min(agreement) > 0.8
+    assert np.median(agreement) > 0.9
+
+
+def test_what_lies_outside_of_the_patch_counts_against_a_pose_and_of_the_image_only_beyond_half(seen):
+    _, truth, view, views = seen
+    ones = np.ones((16, 64, 64), np.float32)
+    aside = truth.copy()
+    aside[0, 3] += 10.0
+    half = np.zeros((64, 64), bool)
+    half[:, 32:] = True
+    everywhere = np.ones((64, 64), bool)
+    inside, outside = views.agreement(np.stack([truth, aside]), view.K, everywhere, ones)
+    assert inside == pytest.approx(1)
+    assert outside == 0
+    assert views.agreement(truth[None], view.K, half, ones)[0] > 0.9
+    assert views.agreement(truth[None], view.K, half[:, ::-1] & half, ones)[0] == 0
+
+
+def test_candidates_differ(tug, seen):
+    frame, truth, _, views = seen
+    start = far_start(truth, 0)
+    with Rasteriser({1: tug}) as rasteriser:
+        target = Target(obj_id=1, mesh=tug, rasteriser=rasteriser)
+        view = look(frame.image, frame.K, start, target, PATCH_PX, WINDOW_SCALE)
+    found = search(view, start, tug, views, np.random.default_rng(0))
+    assert 1 < len(found) <= CANDIDATES
+    assert min(distances(tug, truth, T) for T in found) < 0.1
+    between = [distances(tug, a, b) for i, a in enumerate(found) for b in found[:i]]
+    assert np.median(between) > APART
 
 
 def test_edges_count_without_their_sign_and_not_across(seen):

@@ -1,28 +1,16 @@
 """Compiled loops over estimates and model points, behind the functions of `metrics`.
 
-Compiled on first use and kept on disk beside this file (or where NUMBA_CACHE_DIR says), so that later runs only load
-them. All arrays are C-contiguous float64; poses are `T_cam_obj`, (b, 4, 4), metres; `symmetries` are (1, s, 4, 4), or
+All arrays are C-contiguous float64; poses are `T_cam_obj`, (b, 4, 4), metres; `symmetries` are (1, s, 4, 4), or
 (b, s, 4, 4) where every estimate has its own, the identity first.
 """
 
-from collections.abc import Callable
-from typing import Any, no_type_check
+from typing import no_type_check
 
-import numba
 import numpy as np
+from posecore.compiled import compiled
 
 
-def _compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile at the first call; where no folder can be written to, each process does so anew."""
-    settings: dict[str, Any] = {"error_model": "numpy", "nogil": True}
-    try:
-        compiled = numba.njit(loop, cache=True, **settings)
-    except RuntimeError:
-        compiled = numba.njit(loop, **settings)
-    return compiled  # type: ignore[no-any-return]
-
-
-@_compiled
+@compiled
 @no_type_check
 def mean_distance(T_est, T_gt, points_m):
     """Average distance of corresponding points for each estimate, (b,)."""
@@ -40,7 +28,7 @@ def mean_distance(T_est, T_gt, points_m):
     return result
 
 
-@_compiled
+@compiled
 @no_type_check
 def max_distance(T_est, T_gt, points_m, symmetries):
     """Largest distance of corresponding points at the best symmetry for each estimate, (b,)."""
@@ -63,7 +51,7 @@ def max_distance(T_est, T_gt, points_m, symmetries):
     return result
 
 
-@_compiled
+@compiled
 @no_type_check
 def projected_distances(T_est, T_gt, K, points_m, symmetries):
     """Of projected points, pixels, (b, 3): largest distance at the best symmetry, average without, average at the best.
@@ -104,7 +92,7 @@ def projected_distances(T_est, T_gt, K, points_m, symmetries):
     return result
 
 
-@_compiled
+@compiled
 @no_type_check
 def nearest_points(query_m, points_m, first, neighbours):
     """Index of the point nearest to each query, (n,), along a Delaunay graph: see `nearest.NearestPoints`.

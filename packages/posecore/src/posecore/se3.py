@@ -111,3 +111,18 @@ def perturb(
     """Rotate a pose by `angle_rad` about a random axis and move its origin by `distance_m` in a random direction."""
     dR = rotation_from_rotvec(random_direction(rng) * angle_rad)
     return apply_update(T_cam_obj, dR, random_direction(rng) * distance_m)
+
+
+def even_directions(count: int) -> Float[Array, "n 3"]:
+    """Unit vectors evenly over the sphere, those of a Fibonacci lattice."""
+    i = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
+
+
+def rotations_along(z: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
+    """`R_cam_obj` of cameras that look along unit vectors of the object frame, turned about them somehow."""
+    helper = np.where(np.abs(z[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
+    x = np.cross(helper, z)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-2)

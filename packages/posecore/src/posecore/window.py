@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from posecore import se3
+
 Array = np.ndarray
 
 
@@ -61,13 +63,7 @@ def fixed_side_px(
     Viewpoints are a Fibonacci sphere with the object centred on the optical axis. Source: ECCV 2018 paper, 3.1;
     method.md, "The pair".
     """
-    i = np.arange(n_views) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * i / n_views), np.pi * (1 + 5**0.5) * i
-    z = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
-    helper = np.where(np.abs(z[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    x = np.cross(helper, z)
-    x /= np.linalg.norm(x, axis=-1, keepdims=True)
-    R = np.stack([x, np.cross(z, x), z], axis=-2)
+    R = se3.rotations_along(se3.even_directions(n_views))
     p = np.einsum("bij,vj->bvi", R, vertices_m) + np.array([0.0, 0.0, distance_min_m])
     depth = np.maximum(p[..., 2:], 1e-3 * distance_min_m)
     uv = p[..., :2] / depth * np.array([K[0, 0], K[1, 1]])

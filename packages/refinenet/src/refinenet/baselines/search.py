@@ -1,79 +1,57 @@
 """Search for the pose whose edges run as the image's do, around a start that may be far off; then edge ICP.
 
 How well the gradient orientations of render and image agree tells the true pose from others sharply: so sharply that
-nothing leads there from afar. So poses are drawn around the start, drawn again around the best of them, ever closer,
-while an edge of the image counts from less and less far away. These spread orientations are those of LINE-2D
-(Hinterstoisser et al., PAMI 2012), in response maps made once for all poses; the draws are an evolution strategy.
+nothing leads there from afar. So tens of thousands of poses are drawn around the start, and again around the best of
+them, ever closer, while an edge of the image counts from less and less far away. These spread orientations are those of
+LINE-2D (Hinterstoisser et al., PAMI 2012), in response maps made once for all poses; the draws are an evolution
+strategy. What agrees best is often not the truth, but the truth is mostly among the poses that agree well: edge ICP
+starts from several, and renders decide.
 """
 
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float
 from posecore import se3
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.simplify import simplified
 
-from refinenet.agreement import RENDER_EDGE, SCENE_EDGE, gradient_agreement, gradients, render_gradients
+from refinenet.agreement import SCENE_EDGE, gradient_agreement, gradients
 from refinenet.baselines.edge_icp import refine_by_edges
 from refinenet.baselines.outcome import Baseline, failed
+from refinenet.baselines.sparse_views import SparseViews, sparse_views
 from refinenet.baselines.view import Target, View, look
 from refinenet.methods import Frame, Refinement, Status
 
 Array = np.ndarray
 ORIENTATIONS = 16
 """Bins of half a turn. Like all below: chosen on renders."""
-MAX_FACES = 64**2
-MIN_EDGE_PX = 20
-"""A render with fewer edge pixels than this is judged as if it had so many."""
+PATCH_PX, JUDGE_PX = 96, 112
+WINDOW_SCALE = 1.9
+MAX_FACES = PATCH_PX**2
+FIRST_DRAWN, FIRST_KEPT, FIRST_SPREAD_PX = 20_000, 400, 3
+MAX_ANGLE_RAD = np.deg2rad(70)
+SHIFT, STRETCH = 0.13, 0.1
+"""Standard deviations of the first draws: across the image in diameters, and of the logarithm of the depth."""
+ROUNDS = ((8000, 200, 2), (6000, 150, 2), (4000, 100, 1), (4000, 100, 1))
+"""Drawn, kept, and from how many pixels away an edge of the image counts."""
+POLISH = ((400, 1, 1), (400, 1, 0), (400, 1, 0))
+"""The same around each candidate alone."""
+SIGMA = np.array([0.15, 0.15, 0.15, 0.04, 0.04, 0.035])
+"""Standard deviations after the first draws: turns in radians, shifts, stretch."""
+SHRINK = 0.65
+"""Factor on them from round to round."""
+CANDIDATES = 10
+APART = 0.12
+"""Candidates differ by so many diameters in the mean of their points."""
+TRIAL_ITERATIONS = 3
+"""Of edge ICP from each of them."""
 MIN_AGREEMENT = 0.1
 """Of gradients in the end, below which nothing was found."""
-ENOUGH_AGREEMENT = 0.55
-"""Below this the search is made again, with other draws. Most rendered poses that end above it are right, few below."""
-TRIES = 3
-
-
-@dataclass(frozen=True, kw_only=True)
-class Stage:
-    """A search at one resolution.
-
-    Attributes:
-        patch_px: Side of the patch.
-        spread_px: From how far away an edge of the image counts, round by round.
-        drawn: Poses drawn in a round; twice as many in the first.
-        kept: The best, which the next round draws around.
-        angle_rad: Standard deviation of the first round's turns about each axis.
-        shift: That of moves across the image, in diameters.
-        stretch: That of the logarithm of the depth.
-        shrink: Factor on the three from round to round.
-        leash: Agreement that a pose must gain to go a standard deviation further from the start, squared.
-    """
-
-    patch_px: int
-    spread_px: tuple[int, ...]
-    drawn: int
-    kept: int
-    angle_rad: float
-    shift: float
-    stretch: float
-    shrink: float
-    leash: float
-
-
-STAGES = (
-    Stage(
-        patch_px=64, spread_px=(4, 4, 3, 3, 2, 2, 1, 1, 0, 0), drawn=80, kept=10,
-        angle_rad=0.5, shift=0.12, stretch=0.08, shrink=0.72, leash=0.008,
-    ),
-    Stage(
-        patch_px=112, spread_px=(2, 2, 1, 1, 0, 0), drawn=48, kept=8,
-        angle_rad=0.15, shift=0.03, stretch=0.04, shrink=0.7, leash=0.0,
-    ),
-)  # fmt: skip
 
 
 class GradientSearch(Baseline):
@@ -88,7 +66,9 @@ class GradientSearch(Baseline):
 
     def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:
         super().__init__(meshes, iterations=iterations)
-        self._quick = Rasteriser({obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()})
+        self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
+        self._quick = Rasteriser(self._simple)
+        self._views: dict[int, SparseViews] = {}
 
     def close(self) -> None:
         """Free what the renderers hold."""
@@ -97,37 +77,32 @@ class GradientSearch(Baseline):
 
     def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
         start = np.ascontiguousarray(T_cam_obj, np.float64)
-        rng = np.random.default_rng([target.obj_id, zlib.crc32(start.tobytes())])
-        if look(frame.image, frame.K, start, target, STAGES[0].patch_px) is None:
+        view = look(frame.image, frame.K, start, target, PATCH_PX, WINDOW_SCALE)
+        if view is None:
             return failed(T_cam_obj, 0, "the start pose shows nothing of the object in the image")
-        best, done = failed(T_cam_obj, 0, ""), 0
-        for _ in range(TRIES):
-            found = self._try(frame, start, target, rng)
-            done += found.iterations
-            best = max(best, found, key=_confidence)
-            if _confidence(best) >= ENOUGH_AGREEMENT:
-                break
+        obj_id = target.obj_id
+        if obj_id not in self._views:
+            self._views[obj_id] = sparse_views(obj_id, self._simple[obj_id], self._quick)
+        rng = np.random.default_rng([obj_id, zlib.crc32(start.tobytes())])
+        quick = replace(target, rasteriser=self._quick)
+        candidates = [start, *search(view, start, target.mesh, self._views[obj_id], rng)]
+        tried = [self._followed(frame, pose, quick, TRIAL_ITERATIONS) for pose in candidates]
+        best = self._followed(frame, max(tried, key=_confidence).T_cam_obj, target, self.iterations)
+        done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
         if _confidence(best) < MIN_AGREEMENT:
             why = f"gradients agree with the image's by {_confidence(best):.2f} at most, {MIN_AGREEMENT} needed"
             return failed(T_cam_obj, done, why)
         return replace(best, iterations=done)
 
-    def _try(self, frame: Frame, start: Float[Array, "4 4"], target: Target, rng: np.random.Generator) -> Refinement:
-        """What one search finds."""
-        pose, rounds = start, 0
-        for stage in STAGES:
-            view = look(frame.image, frame.K, pose, target, stage.patch_px)
-            if view is None:  # the stage before went astray, which its agreement will tell
-                break
-            pose = search(view, pose, target, self._quick, stage, rng)
-            rounds += len(stage.spread_px)
-        by_edges = refine_by_edges(frame.image, frame.K, pose, target, self.iterations)
-        agreement, at_edges = (_agreement(frame, T, target) for T in (pose, by_edges.T_cam_obj))
-        status = Status.STOPPED
-        if not by_edges.failed and at_edges >= agreement:
-            pose, agreement, status = by_edges.T_cam_obj, at_edges, by_edges.status
-        done = rounds + by_edges.iterations
-        return Refinement(T_cam_obj=pose, status=status, iterations=done, confidence=agreement)
+    def _followed(self, frame: Frame, pose: Float[Array, "4 4"], target: Target, iterations: int) -> Refinement:
+        """A pose, or what edge ICP makes of it where that agrees better."""
+        by_edges = refine_by_edges(frame.image, frame.K, pose, target, iterations)
+        agreement = _agreement(frame, pose, target)
+        at_edges = 0.0 if by_edges.failed else _agreement(frame, by_edges.T_cam_obj, target)
+        if at_edges > agreement:
+            return replace(by_edges, confidence=at_edges)
+        done = by_edges.iterations
+        return Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=done, confidence=agreement)
 
 
 def _confidence(found: Refinement) -> float:
@@ -135,45 +110,72 @@ def _confidence(found: Refinement) -> float:
 
 
 def _agreement(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> float:
-    """How well a pose fits in the end, in [0, 1]; 0 where nothing of it is to be seen."""
-    view = look(frame.image, frame.K, T_cam_obj, target, STAGES[-1].patch_px)
+    """How well a pose fits in the end, in [0, 1]; less where more than half of it lies outside of the image."""
+    view = look(frame.image, frame.K, T_cam_obj, target, JUDGE_PX)
     if view is None:
         return 0.0
-    return float(gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.in_image[None])[0])
+    inside = 2 * (view.mask & view.in_image).sum() / view.mask.sum()
+    fit = gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.in_image[None])[0]
+    return float(fit * min(1.0, inside))
 
 
 def search(
-    view: View,
-    start: Float[Array, "4 4"],
-    target: Target,
-    rasteriser: Rasteriser,
-    stage: Stage,
-    rng: np.random.Generator,
-) -> Float[Array, "4 4"]:
-    """The best pose of a stage.
+    view: View, start: Float[Array, "4 4"], mesh: Mesh, views: SparseViews, rng: np.random.Generator
+) -> list[Float[Array, "4 4"]]:
+    """Poses that agree well, each unlike the others; the best first.
 
     Args:
         view: The start, looked at.
         start: Start pose, metres.
-        target: Object.
-        rasteriser: Draws it.
-        stage: How to search.
+        mesh: Object.
+        views: Its edges.
         rng: Source of every draw.
     """
-    responses = {spread: response_maps(view, spread) for spread in set(stage.spread_px)}
-    sigma = np.array([stage.angle_rad] * 3 + [stage.shift] * 2 + [stage.stretch])
-    best = np.zeros((1, 6))
-    for number, spread in enumerate(stage.spread_px):
-        drawn = stage.drawn * (2 if number == 0 else 1)
-        around = best[rng.integers(len(best), size=drawn)]
-        moves = np.concatenate([best, around + rng.normal(size=(drawn, 6)) * sigma * stage.shrink**number])
-        T = moved_by(start, moves, target.mesh)
-        layers = rasteriser.render(target.obj_id, view.K, T, stage.patch_px, stage.patch_px)
-        assert layers.rgb is not None
-        agreement = edge_agreement(layers.rgb, layers.mask, view.in_image, responses[spread])
-        score = agreement - stage.leash * np.square(moves / sigma).sum(axis=1)
-        best = moves[np.argsort(-score, kind="stable")[: stage.kept]]
-    return np.asarray(moved_by(start, best[:1], target.mesh)[0])
+    responses = {spread: response_maps(view, spread) for spread in {FIRST_SPREAD_PX} | {r[2] for r in ROUNDS + POLISH}}
+
+    def best_of(moves: Float[Array, "n 6"], kept: int, spread_px: int) -> tuple[Array, Array]:
+        T = moved_by(start, moves, mesh)
+        agreement = views.agreement(T, view.K, view.in_image, responses[spread_px])
+        order = np.argsort(-agreement, kind="stable")[:kept]
+        return moves[order], agreement[order]
+
+    def drawn_again(best: Array, sigma: Array, rounds: tuple[tuple[int, int, int], ...]) -> tuple[Array, Array, Array]:
+        agreement = np.zeros(len(best))
+        for drawn, kept, spread_px in rounds:
+            around = best[rng.integers(len(best), size=drawn)] + rng.normal(size=(drawn, 6)) * sigma
+            best, agreement = best_of(np.concatenate([best, around]), kept, spread_px)
+            sigma = sigma * SHRINK
+        return best, agreement, sigma
+
+    best, _ = best_of(_first_moves(rng), FIRST_KEPT, FIRST_SPREAD_PX)
+    best, _, sigma = drawn_again(best, SIGMA, ROUNDS)
+    found = [drawn_again(best[i : i + 1], sigma, POLISH) for i in _unlike(moved_by(start, best, mesh), mesh)]
+    found.sort(key=lambda one: -one[1][0])
+    return [moved_by(start, moves, mesh)[0] for moves, _, _ in found]
+
+
+def _first_moves(rng: np.random.Generator) -> Float[Array, "n 6"]:
+    """Turns about any axis and by any angle up to the largest, and shifts; the first of them is none."""
+    axis = rng.normal(size=(FIRST_DRAWN, 3))
+    angle_rad = rng.uniform(0, MAX_ANGLE_RAD, (FIRST_DRAWN, 1))
+    shifts = rng.normal(size=(FIRST_DRAWN, 3)) * np.array([SHIFT, SHIFT, STRETCH])
+    moves = np.concatenate([axis / np.linalg.norm(axis, axis=1, keepdims=True) * angle_rad, shifts], axis=1)
+    moves[0] = 0
+    return np.asarray(moves)
+
+
+def _unlike(T_cam_obj: Float[Array, "n 4 4"], mesh: Mesh) -> list[int]:
+    """Indices of the first poses that are far from those before."""
+    corners_m = mesh.center_m + 0.3 * mesh.diameter_m * se3.even_directions(32)
+    points_m = se3.apply(T_cam_obj, corners_m)
+    chosen: list[int] = []
+    for i, points in enumerate(points_m):
+        distance_m = np.linalg.norm(points_m[chosen] - points, axis=-1).mean(axis=-1)
+        if (distance_m > APART * mesh.diameter_m).all():
+            chosen.append(i)
+        if len(chosen) == CANDIDATES:
+            break
+    return chosen
 
 
 def moved_by(start: Float[Array, "4 4"], moves: Float[Array, "n 6"], mesh: Mesh) -> Float[Array, "n 4 4"]:
@@ -188,7 +190,9 @@ def moved_by(start: Float[Array, "4 4"], moves: Float[Array, "n 6"], mesh: Mesh)
 def response_maps(view: View, spread_px: int) -> Float[Array, "o p p"]:
     """For each orientation of an edge, how well the image's edges within `spread_px` agree with it, in [0, 1]."""
     unit, strength = gradients(view.scene_rgb[None].astype(np.float32))
-    doubled = _doubled(unit[0]) * ((strength[0] > SCENE_EDGE) & view.in_image)[..., None]
+    x, y = unit[0, ..., 0], unit[0, ..., 1]
+    # of doubled angle: opposite gradients have the same
+    doubled = np.stack([x * x - y * y, 2 * x * y], axis=-1) * ((strength[0] > SCENE_EDGE) & view.in_image)[..., None]
     angle_rad = 2 * np.pi * np.arange(ORIENTATIONS) / ORIENTATIONS
     maps = np.tensordot(np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=1), doubled, axes=(1, 2))
     maps = np.maximum(maps, 0).astype(np.float32)
@@ -196,25 +200,3 @@ def response_maps(view: View, spread_px: int) -> Float[Array, "o p p"]:
         disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * spread_px + 1,) * 2)
         maps = np.stack([cv2.dilate(one, disc) for one in maps])
     return np.asarray(maps)
-
-
-def edge_agreement(
-    rgb: UInt8[Array, "n p p 3"],
-    mask: Bool[Array, "n p p"],
-    in_image: Bool[Array, "p p"],
-    responses: Float[Array, "o p p"],
-) -> Float[Array, " n"]:
-    """Mean response at the edges of renders, silhouettes included."""
-    unit, strength = render_gradients(rgb, mask)
-    n, row, column = np.nonzero((strength > RENDER_EDGE) & in_image)
-    doubled = _doubled(unit[n, row, column])
-    turn = np.arctan2(doubled[:, 1], doubled[:, 0]) / (2 * np.pi)
-    orientation: Int[Array, " e"] = np.rint(turn * ORIENTATIONS).astype(np.int64) % ORIENTATIONS
-    total = np.bincount(n, weights=responses[orientation, row, column], minlength=len(rgb))
-    return np.asarray(total / np.maximum(np.bincount(n, minlength=len(rgb)), MIN_EDGE_PX))
-
-
-def _doubled(unit: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
-    """Directions of doubled angle: opposite gradients have the same."""
-    x, y = unit[..., 0], unit[..., 1]
-    return np.stack([x * x - y * y, 2 * x * y], axis=-1)

@@ -89,12 +89,17 @@ def finest_px(K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh
 
 
 def look(
-    image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], target: Target, patch_px: int
+    image: UInt8[Array, "h w 3"],
+    K: Float[Array, "3 3"],
+    T_cam_obj: Float[Array, "4 4"],
+    target: Target,
+    patch_px: int,
+    scale: float = WINDOW_SCALE,
 ) -> View | None:
-    """The patch around a pose; None where no pixel of the object would show inside the image."""
+    """The patch around a pose, `scale` projected diameters wide; None where no pixel of the object is in the image."""
     if not finest_px(K, T_cam_obj, target.mesh, patch_px):
         return None
-    window = diameter_window(K, T_cam_obj, target.mesh.center_m, target.mesh.diameter_m, WINDOW_SCALE)
+    window = diameter_window(K, T_cam_obj, target.mesh.center_m, target.mesh.diameter_m, scale)
     K_patch = crop_K(K, window, patch_px)
     height_px, width_px = image.shape[:2]
     centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px

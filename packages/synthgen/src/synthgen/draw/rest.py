@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from posecore.mesh import Mesh
+from posecore.se3 import even_directions
 from scipy.spatial import ConvexHull, QhullError
 
 Array = np.ndarray
@@ -54,7 +55,7 @@ def find_rest(mesh: Mesh) -> Rest:
     follower = _hit(normals, height, normals)
     downhill = height[follower] < height * (1.0 - _SAME)
     follower = np.where(downhill, follower, np.arange(len(height)))
-    landed = _hit(normals, height, _even_directions(_DROPS))
+    landed = _hit(normals, height, even_directions(_DROPS))
     for _ in range(len(height)):
         onward = follower[landed]
         if np.array_equal(onward, landed):
@@ -88,14 +89,7 @@ def _hit(normals: Float[Array, "f 3"], height: Float[Array, "f"], rays: Float[Ar
 
 
 def _extreme(points: Float[Array, "p 3"]) -> Float[Array, "q 3"]:
-    return np.asarray(points[np.unique((points @ _even_directions(_MOST_HULL_POINTS).T).argmax(axis=0))])
-
-
-def _even_directions(count: int) -> Float[Array, "n 3"]:
-    """Fibonacci sphere."""
-    i = np.arange(count) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
-    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
+    return np.asarray(points[np.unique((points @ even_directions(_MOST_HULL_POINTS).T).argmax(axis=0))])
 
 
 def _centre_of_mass(mesh: Mesh, hull: ConvexHull) -> Float[Array, "3"]:
