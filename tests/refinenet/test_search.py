@@ -10,13 +10,18 @@ from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
 from refinenet.baselines.search import (
     APART,
+    BEYOND_RAD,
     CANDIDATES,
+    MAX_ANGLE_RAD,
     PATCH_PX,
     ROUNDS,
+    SHIFT,
+    STRETCH,
     WINDOW_SCALE,
     moved_by,
     response_maps,
     search,
+    unlikely,
 )
 from refinenet.baselines.sparse_views import sparse_views
 from refinenet.baselines.view import Target, look
@@ -171,3 +176,14 @@ def test_moves_are_about_the_centre_across_and_along_the_ray(tug):
     np.testing.assert_allclose(aside - same, [0.2 * tug.diameter_m, 0, 0], atol=1e-12)
     np.testing.assert_allclose(turned, same, atol=1e-12)
     assert se3.rotation_angle_rad(T[3, :3, :3] @ start[:3, :3].T) == pytest.approx(0.5)
+
+
+def test_how_unlikely_a_pose_is_counts_standard_deviations(tug):
+    start = se3.make_T(se3.random_rotation(np.random.default_rng(0)), np.array([0.1, -0.05, 0.7]))
+    moves = np.zeros((5, 6))
+    moves[1, 5] = 2 * STRETCH
+    moves[2, 3] = 3 * SHIFT
+    moves[3, 1] = MAX_ANGLE_RAD - 0.01
+    moves[4, 1] = MAX_ANGLE_RAD + BEYOND_RAD
+    found = [unlikely(start, T, tug) for T in moved_by(start, moves, tug)]
+    np.testing.assert_allclose(found, [0, 4, 9, 0, 1], atol=1e-6)

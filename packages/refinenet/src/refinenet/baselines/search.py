@@ -50,6 +50,10 @@ APART = 0.12
 """Candidates differ by so many diameters in the mean of their points."""
 TRIAL_ITERATIONS = 3
 """Of edge ICP from each of them."""
+LEASH = 0.01
+"""Agreement that a pose must have more for a standard deviation further from the start, squared."""
+BEYOND_RAD = 0.2
+"""The standard deviation of angles beyond the largest that was drawn; under it, all are as likely."""
 MIN_AGREEMENT = 0.1
 """Of gradients in the end, below which nothing was found."""
 
@@ -87,7 +91,8 @@ class GradientSearch(Baseline):
         quick = replace(target, rasteriser=self._quick)
         candidates = [start, *search(view, start, target.mesh, self._views[obj_id], rng)]
         tried = [self._followed(frame, pose, quick, TRIAL_ITERATIONS) for pose in candidates]
-        best = self._followed(frame, max(tried, key=_confidence).T_cam_obj, target, self.iterations)
+        scores = [_confidence(one) - LEASH * unlikely(start, one.T_cam_obj, target.mesh) for one in tried]
+        best = self._followed(frame, tried[int(np.argmax(scores))].T_cam_obj, target, self.iterations)
         done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
         if _confidence(best) < MIN_AGREEMENT:
             why = f"gradients agree with the image's by {_confidence(best):.2f} at most, {MIN_AGREEMENT} needed"
@@ -185,6 +190,15 @@ def moved_by(start: Float[Array, "4 4"], moves: Float[Array, "n 6"], mesh: Mesh)
     R = se3.rotation_from_rotvec(moves[:, :3]) @ start[:3, :3]
     t = np.exp(moves[:, 5:]) * (centre_m + across_m) - R @ mesh.center_m
     return se3.make_T(R, t)
+
+
+def unlikely(start: Float[Array, "4 4"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh) -> float:
+    """How far a pose is from the start for the distribution of the first draws: standard deviations, squared."""
+    before_m, after_m = (T[:3, :3] @ mesh.center_m + T[:3, 3] for T in (start, T_cam_obj))
+    across_m = after_m[:2] * before_m[2] / after_m[2] - before_m[:2]
+    beyond_rad = max(0.0, float(se3.rotation_angle_rad(T_cam_obj[:3, :3] @ start[:3, :3].T)) - MAX_ANGLE_RAD)
+    shifts = np.append(across_m / (SHIFT * mesh.diameter_m), np.log(after_m[2] / before_m[2]) / STRETCH)
+    return float(np.square(shifts).sum() + (beyond_rad / BEYOND_RAD) ** 2)
 
 
 def response_maps(view: View, spread_px: int) -> Float[Array, "o p p"]:
