@@ -47,7 +47,7 @@ SHRINK = 0.65
 """Factor on them from round to round."""
 CANDIDATES = 10
 APART = 0.12
-"""Candidates differ by so many diameters in the mean of their points."""
+"""Candidates differ by so many diameters in the mean of points around the centre, before each is searched around."""
 TRIAL_ITERATIONS = 3
 """Of edge ICP from each of them."""
 LEASH = 0.01
@@ -102,8 +102,8 @@ class GradientSearch(Baseline):
     def _followed(self, frame: Frame, pose: Float[Array, "4 4"], target: Target, iterations: int) -> Refinement:
         """A pose, or what edge ICP makes of it where that agrees better."""
         by_edges = refine_by_edges(frame.image, frame.K, pose, target, iterations)
-        agreement = _agreement(frame, pose, target)
-        at_edges = 0.0 if by_edges.failed else _agreement(frame, by_edges.T_cam_obj, target)
+        agreement = agreement_of(frame, pose, target)
+        at_edges = 0.0 if by_edges.failed else agreement_of(frame, by_edges.T_cam_obj, target)
         if at_edges > agreement:
             return replace(by_edges, confidence=at_edges)
         done = by_edges.iterations
@@ -114,7 +114,7 @@ def _confidence(found: Refinement) -> float:
     return found.confidence or 0.0
 
 
-def _agreement(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> float:
+def agreement_of(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> float:
     """How well a pose fits in the end, in [0, 1]; less where more than half of it lies outside of the image."""
     view = look(frame.image, frame.K, T_cam_obj, target, JUDGE_PX)
     if view is None:
@@ -154,7 +154,7 @@ def search(
 
     best, _ = best_of(_first_moves(rng), FIRST_KEPT, FIRST_SPREAD_PX)
     best, _, sigma = drawn_again(best, SIGMA, ROUNDS)
-    found = [drawn_again(best[i : i + 1], sigma, POLISH) for i in _unlike(moved_by(start, best, mesh), mesh)]
+    found = [drawn_again(best[i : i + 1], sigma, POLISH) for i in unlike(moved_by(start, best, mesh), mesh)]
     found.sort(key=lambda one: -one[1][0])
     return [moved_by(start, moves, mesh)[0] for moves, _, _ in found]
 
@@ -169,10 +169,9 @@ def _first_moves(rng: np.random.Generator) -> Float[Array, "n 6"]:
     return np.asarray(moves)
 
 
-def _unlike(T_cam_obj: Float[Array, "n 4 4"], mesh: Mesh) -> list[int]:
+def unlike(T_cam_obj: Float[Array, "n 4 4"], mesh: Mesh) -> list[int]:
     """Indices of the first poses that are far from those before."""
-    corners_m = mesh.center_m + 0.3 * mesh.diameter_m * se3.even_directions(32)
-    points_m = se3.apply(T_cam_obj, corners_m)
+    points_m = se3.apply(T_cam_obj, mesh.center_m + 0.3 * mesh.diameter_m * se3.even_directions(32))
     chosen: list[int] = []
     for i, points in enumerate(points_m):
         distance_m = np.linalg.norm(points_m[chosen] - points, axis=-1).mean(axis=-1)

@@ -89,8 +89,8 @@ def sparse_views(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> SparseViews
         ):
             near_m = np.where(mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8)))  # beside it, the surface's
             pixels = np.argwhere(_ridge(direction, edge) & (near_m > 0))
-            if len(pixels) == 0:  # nothing is seen from there
-                pixels = np.full((1, 2), VIEW_PX // 2)
+            if len(pixels) == 0:  # nothing is seen from there, as of a sheet from its side: the centre stands for it
+                pixels, near_m = np.full((1, 2), VIEW_PX // 2), np.full_like(near_m, T_cam_obj[2, 3])
             row, column = pixels[rng.choice(len(pixels), POINTS, replace=len(pixels) < POINTS)].T
             seen = near_m[row, column].astype(np.float64)
             p_cam_m = back_project(K, np.stack([column, row], axis=1) + 0.5, seen)
