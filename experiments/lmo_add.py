@@ -8,10 +8,11 @@ Networks learn from rendered pairs of the meshes alone. The real frames are for 
 this file was chosen by a result on them. Start poses are the result file `init*.csv` in --data.
 
   --smoke  16 training steps: a test of the plumbing
-  --small  preset compact, one network over all objects, with each loss, 6 000 rasterised pairs
+  --small  preset compact, one network over all objects, with each loss, 6 000 rasterised pairs; with
+           --backbone-weights preset paper as well, 2 000 steps of 16 on 6 000 pairs of its own
   --full   preset paper, a network for each loss and object as in the paper, 200 000 path-traced pairs each; a GPU
 
-    python experiments/lmo_add.py --small --data lmo
+    python experiments/lmo_add.py --small --data lmo --backbone-weights inception_v3_stem.safetensors
     python experiments/lmo_add.py --full --data lmo --backbone-weights inception_v3_stem.safetensors
 """
 
@@ -28,6 +29,7 @@ from experiments.common import (
     Comparison,
     Experiment,
     Inputs,
+    Network,
     compared,
     full_networks,
     lmo_meshes,
@@ -58,6 +60,8 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     if not full:
         names = ("mse", "contour-forward", "contour", "compact") if size == "small" else ("compact",)
         networks = small_networks(TRAINING[size], names)
+        if size == "small" and inputs.backbone_weights is not None:
+            networks["paper"] = Network(train=f"--preset paper --steps 2000 --threads 1 {inputs.stem()}")
     return compared(
         work,
         Comparison(
