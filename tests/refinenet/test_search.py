@@ -1,7 +1,9 @@
 """Search by gradients: it comes back from starts that are too far off for anything that follows them downhill."""
 
+import re
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from posecore import se3
@@ -64,6 +66,22 @@ def test_far_starts_come_back(shared_data):
     assert by_search[:, 0].min() > 0.1  # none starts there
     assert (by_search[:, 1] < 0.1).sum() >= 5
     assert (by_edges[:, 1] < 0.1).sum() <= 3
+
+
+def test_where_the_object_is_not_it_fails(tug, seen):
+    """Clutter has edges that some pose runs along, which is not enough; the start is kept."""
+    frame, truth, _, _ = seen
+    blobs = np.random.default_rng(0).normal(size=frame.image.shape).astype(np.float32)
+    blobs = cv2.GaussianBlur(blobs, (0, 0), 3.0)
+    image = (128 + 60 * blobs / blobs.std()).clip(0, 255).astype(np.uint8)
+    refiner = make_baseline("search", {1: tug}, 2)
+    start = far_start(truth, 0)
+    (result,) = refiner.refine_batch(replace(frame, image=image), [Request(obj_id=1, T_cam_obj=start)])
+    refiner.close()
+    assert result.failed
+    agreement = re.search(r"agree with the image's by (0\.\d\d) at most, 0\.4 needed", result.failure)
+    assert agreement and 0.1 < float(agreement[1]) < 0.4, result.failure
+    np.testing.assert_array_equal(result.T_cam_obj, start)
 
 
 @pytest.fixture(scope="module")

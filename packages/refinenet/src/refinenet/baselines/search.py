@@ -54,8 +54,8 @@ LEASH = 0.01
 """Agreement that a pose must have more for a standard deviation further from the start, squared."""
 BEYOND_RAD = 0.2
 """The standard deviation of angles beyond the largest that was drawn; under it, all are as likely."""
-MIN_AGREEMENT = 0.1
-"""Of gradients in the end, below which nothing was found."""
+MIN_AGREEMENT = 0.4
+"""Of gradients in the end, below which a pose is more likely to be wrong than right, and mostly worse than its start."""
 
 
 class GradientSearch(Baseline):
