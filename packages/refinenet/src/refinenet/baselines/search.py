@@ -55,7 +55,7 @@ LEASH = 0.01
 BEYOND_RAD = 0.2
 """The standard deviation of angles beyond the largest that was drawn; under it, all are as likely."""
 MIN_AGREEMENT = 0.4
-"""Of gradients in the end, below which a pose is more likely to be wrong than right, and mostly worse than its start."""
+"""Of gradients in the end, below which a pose is more likely wrong than right, and mostly worse than its start."""
 
 
 class GradientSearch(Baseline):
