@@ -167,6 +167,15 @@ def test_meshes_that_are_missing_are_said(tmp_path) -> None:
         experiment("perturbation_curves").plan(tmp_path, "full", common.Inputs(data=tmp_path))
 
 
+def test_preset_paper_is_trained_on_lmo_where_its_stem_is_given(inputs, tmp_path) -> None:
+    trained = {
+        given: [step.name for step in experiment("lmo_add").plan(tmp_path, "small", what) if step.run is not None]
+        for given, what in (("stem", inputs), ("none", common.Inputs(data=inputs.data)))
+    }
+    assert trained["stem"] == [*trained["none"], "train-paper"]
+    assert len(trained["none"]) == 4
+
+
 def test_a_file_to_work_in_is_refused(tmp_path, monkeypatch) -> None:
     file = tmp_path / "notes.txt"
     file.write_text("kept")
