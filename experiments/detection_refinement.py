@@ -76,7 +76,7 @@ EXPERIMENT = Experiment(
     },
     minutes={
         "smoke": "half a minute on two CPU cores",
-        "small": "a quarter of an hour on two CPU cores",
+        "small": "a few minutes on two CPU cores",
         "full": "days, most of them rendering; a GPU",
     },
     plan=plan,

@@ -89,7 +89,7 @@ EXPERIMENT = Experiment(
     },
     minutes={
         "smoke": "half a minute on two CPU cores",
-        "small": "an hour on two CPU cores, most of it search",
+        "small": "twenty minutes on two CPU cores, most of it search",
         "full": "days, most of them rendering; a GPU",
     },
     plan=plan,
