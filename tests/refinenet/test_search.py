@@ -79,7 +79,7 @@ def test_where_the_object_is_not_it_fails(tug, seen):
     (result,) = refiner.refine_batch(replace(frame, image=image), [Request(obj_id=1, T_cam_obj=start)])
     refiner.close()
     assert result.failed
-    agreement = re.search(r"agree with the image's by (0\.\d\d) at most, 0\.4 needed", result.failure)
+    agreement = re.search(r"agree with the image's by (0\.\d{3}) at most, 0\.4 needed", result.failure)
     assert agreement and 0.1 < float(agreement[1]) < 0.4, result.failure
     np.testing.assert_array_equal(result.T_cam_obj, start)
 

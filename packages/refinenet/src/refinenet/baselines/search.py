@@ -95,7 +95,7 @@ class GradientSearch(Baseline):
         best = self._followed(frame, tried[int(np.argmax(scores))].T_cam_obj, target, self.iterations)
         done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
         if _confidence(best) < MIN_AGREEMENT:
-            why = f"gradients agree with the image's by {_confidence(best):.2f} at most, {MIN_AGREEMENT} needed"
+            why = f"gradients agree with the image's by {_confidence(best):.3f} at most, {MIN_AGREEMENT} needed"
             return failed(T_cam_obj, done, why)
         return replace(best, iterations=done)
 
