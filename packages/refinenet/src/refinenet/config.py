@@ -9,7 +9,7 @@ from typing import Literal
 from posecore import config as posecore_config
 from posecore.errors import ConfigError
 
-PRESETS = ("paper", "compact", "plus")
+PRESETS = ("paper", "compact", "plus", "flow")
 
 
 def _require(ok: bool, message: str) -> None:
@@ -37,26 +37,27 @@ class NetworkConfig:
     """Architecture.
 
     Attributes:
-        kind: `paper`, `compact` or `plus`.
+        kind: `paper`, `compact`, `plus` or `flow`.
         patch_px: side of both input patches.
         rotation: output of the rotation head, `6d` or `quaternion`; None is the kind's own: `paper`'s is `quaternion`,
-            the others' `6d`.
+            the others' `6d`. `flow` has none of these two: its pose is solved for.
         translation: output of the translation head, image-plane shift and depth ratio as the `crop` shows them, or
             metres in `camera` axes; None is the kind's own: `paper`'s is `camera`, the others' `crop`.
-        confidence: whether a third head tells how well the hypothesis fits.
+        confidence: whether another head tells how well the hypothesis fits.
         backbone: stem of `paper`.
         branch_channels: channels of `paper`'s last strided convolution, before the heads.
         encoder: channels of the two stages that each patch goes through, to a quarter of its size; not in `paper`.
-        match_channels: length of the features whose dot products are matched; not in `paper`.
-        match_radius: how far they are matched, in cells of a quarter of the patch's resolution.
+        match_channels: length of the features whose dot products are matched; neither in `paper` nor in `flow`.
+        match_radius: how far they are matched, in cells of a quarter of the patch's resolution; in `flow`, how far
+            gradients are, in cells of half of it.
         appearance_channels: channels that tell what is there, beside what moved; not in `paper`.
         widths: channels of the two layers after matching, at an eighth of the patch's size; `plus` ends with the second
-            at a thirty-second.
-        hidden: units before the heads; not in `paper`.
+            at a thirty-second, `flow` has the first at a quarter and the second down to a sixteenth.
+        hidden: units before the heads; neither in `paper` nor in `flow`.
         head_std: standard deviation of the heads' initial weights.
     """
 
-    kind: Literal["paper", "compact", "plus"]
+    kind: Literal["paper", "compact", "plus", "flow"]
     patch_px: int
     rotation: Literal["6d", "quaternion"] | None = None
     translation: Literal["crop", "camera"] | None = None
@@ -81,7 +82,20 @@ class NetworkConfig:
             self.kind != "plus" or self.patch_px % 32 == 0,
             f"patch_px is {self.patch_px}, expected a multiple of 32 for kind=plus",
         )
+        _require(
+            self.kind != "flow" or self.patch_px % 16 == 0,
+            f"patch_px is {self.patch_px}, expected a multiple of 16 for kind=flow",
+        )
+        _require(
+            self.kind != "flow" or (self.rotation is None and self.translation is None),
+            "rotation and translation are outputs of heads, which kind=flow does not have: leave both null",
+        )
         _require(1 <= self.match_radius <= 16, f"match_radius is {self.match_radius}, expected 1 to 16 cells")
+
+    @property
+    def sees_depth(self) -> bool:
+        """Whether the network asks for the hypothesis' depth."""
+        return self.kind == "flow"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -204,7 +218,7 @@ class LossConfig:
     Attributes:
         name: which.
         gamma: weight of the translation in `mse`, per metre.
-        point_weight: weight of the point loss in `contour+point`.
+        point_weight: weight of the point loss in `contour+point` and `flow+point`.
         rotation_weight: weight of the rotation within the point loss; image-plane position and depth have 1.
         contour_points: contour points used of each patch.
         model_points: model points of the point loss.
@@ -212,7 +226,7 @@ class LossConfig:
         confidence_weight: weight of the confidence's cross-entropy, for a network with that output.
     """
 
-    name: Literal["contour", "contour-forward", "mse", "point", "contour+point"] = "contour"
+    name: Literal["contour", "contour-forward", "mse", "point", "contour+point", "flow+point"] = "contour"
     gamma: float = 10.0
     point_weight: float = 1.0
     rotation_weight: float = 1.0
@@ -328,7 +342,7 @@ class TrainConfig:
         checkpoint_every: steps between checkpoints.
     """
 
-    preset: Literal["paper", "compact", "plus"]
+    preset: Literal["paper", "compact", "plus", "flow"]
     network: NetworkConfig
     window: WindowConfig
     hypothesis: HypothesisConfig = field(default_factory=HypothesisConfig)
@@ -358,6 +372,11 @@ class TrainConfig:
         _require(
             self.recut or not self.augment.occlusion,
             "augment.occlusion needs pairs made in the training loop: window.kind=diameter or hypothesis.fresh=true",
+        )
+
+        _require(
+            self.loss.name != "flow+point" or self.network.kind == "flow",
+            f"loss.name is flow+point, but kind {self.network.kind} predicts no flow; use kind flow, or another loss",
         )
 
     @property

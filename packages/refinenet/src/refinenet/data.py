@@ -56,7 +56,7 @@ class Batch(NamedTuple):
 
     def to(self, device: torch.device) -> "Batch":
         """The same on another device; copies from pinned memory are only queued."""
-        pair = Pair(*(x.to(device, non_blocking=True) for x in self.pair))
+        pair = self.pair.mapped(lambda x: x.to(device, non_blocking=True))
         target = self.target.mapped(lambda x: x.to(device, non_blocking=True))
         return self._replace(pair=pair, target=target)
 
@@ -102,7 +102,7 @@ class PairSource:
             ShardError: One cannot be read, without that setting.
         """
         fields: tuple[str, ...] = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
-        if self._rasteriser is None and self._config.network.confidence:
+        if self._rasteriser is None and (self._config.network.confidence or self._config.network.sees_depth):
             fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:
             self.reader.refresh()
@@ -138,6 +138,8 @@ class PairSource:
             arrays = self._make(samples, rngs)
         if arrays is None:
             return None
+        if not self._config.network.sees_depth:
+            arrays = replace(arrays, hypothesis_depth_m=None)
         batch = _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
         told, self._untold = tuple(self._untold), []
         return batch._replace(skipped=told)
@@ -172,7 +174,8 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
         scene_bits=torch.from_numpy(np.ascontiguousarray(arrays.scene_bits)),
         overlap=None if arrays.overlap is None else real(arrays.overlap),
     )
-    pair = Pair(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop)
+    depth_m = None if arrays.hypothesis_depth_m is None else real(arrays.hypothesis_depth_m)
+    pair = Pair(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop, depth_m)
     return Batch(
         pair, target, torch.tensor(np.array(ids, np.int64)),
         visible_share=real(arrays.visible_share), render_colours=real(arrays.render_colours),

@@ -18,9 +18,11 @@ from posecore.files import write_atomic
 from torch import Tensor, nn
 
 from refinenet.checkpoint import Checkpoint
+from refinenet.config import NetworkConfig
 from refinenet.network import Pair
 
-INPUTS = ("scene_rgb", "hypothesis_rgb", "T_cam_obj", "K_crop")
+INPUTS = ("scene_rgb", "hypothesis_rgb", "T_cam_obj", "K_crop", "hypothesis_depth_m")
+"""The last for networks that see depth only."""
 OUTPUTS = ("dR", "dt_m", "confidence_logit")
 TOLERANCES = {"dR": 1e-4, "dt_m": 1e-5, "confidence_logit": 1e-3}
 """Largest difference from the network in any entry: of a rotation, in metres, of a logit."""
@@ -31,17 +33,18 @@ Outputs = dict[str, np.ndarray]
 
 
 class FlatNetwork(nn.Module):
-    """A network with tensors in and tensors out: `INPUTS` to `OUTPUTS`, without the confidence where it has none."""
+    """A network with tensors in and tensors out: `INPUTS` to `OUTPUTS`, without those that it does not have."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
         self.network = network
 
     def forward(
-        self, scene_rgb: Tensor, hypothesis_rgb: Tensor, T_cam_obj: Tensor, K_crop: Tensor
-    ) -> tuple[Tensor, ...]:
+        self, scene_rgb: Tensor, hypothesis_rgb: Tensor, T_cam_obj: Tensor, K_crop: Tensor,
+        hypothesis_depth_m: Tensor | None = None,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
         """The update of each pair, in camera axes about the object's origin."""
-        update = self.network(Pair(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop))
+        update = self.network(Pair(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
         return (update.dR, update.dt) if update.confidence is None else (update.dR, update.dt, update.confidence)
 
 
@@ -67,10 +70,11 @@ def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
     for parameter in network.parameters():
         parameter.requires_grad_(False)
     about = json.dumps(_about(loaded))
-    patch_px = loaded.provenance.config.network.patch_px
-    content = _onnx(network, patch_px, about) if out.suffix == ".onnx" else _program(network, patch_px, about)
+    config = loaded.provenance.config.network
+    example = random_pairs(2, config.patch_px, seed=0, depth=config.sees_depth)
+    content = _onnx(network, example, about) if out.suffix == ".onnx" else _program(network, example, about)
     run = _onnx_runner(content) if out.suffix == ".onnx" else _program_runner(content)
-    differences = _differences(network, run, patch_px)
+    differences = _differences(network, run, config)
     for name, difference in differences.items():
         if not difference <= TOLERANCES[name]:
             raise CheckpointError(
@@ -81,8 +85,8 @@ def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
     return differences
 
 
-def random_pairs(b: int, patch_px: int, seed: int) -> tuple[Tensor, ...]:
-    """Inputs of plausible sizes, in the order of `INPUTS`."""
+def random_pairs(b: int, patch_px: int, seed: int, *, depth: bool = False) -> tuple[Tensor, ...]:
+    """Inputs of plausible sizes, in the order of `INPUTS`, the last with `depth` only."""
     generator = torch.Generator().manual_seed(seed)
     scene, hypothesis = (
         torch.randint(0, 256, (b, 3, patch_px, patch_px), dtype=torch.uint8, generator=generator) for _ in range(2)
@@ -93,13 +97,17 @@ def random_pairs(b: int, patch_px: int, seed: int) -> tuple[Tensor, ...]:
     focal, half = 5.0 * patch_px, 0.5 * patch_px
     K = torch.tensor([[focal, 0.0, half], [0.0, focal, half], [0.0, 0.0, 1.0]]).repeat(b, 1, 1)
     K[:, :2, 2] -= focal * T[:, :2, 3] / T[:, 2:3, 3]  # the patch is centred on the object
-    return scene, hypothesis, T, K
+    if not depth:
+        return scene, hypothesis, T, K
+    hills = torch.rand(b, 1, 4, 4, generator=generator)
+    relief = nn.functional.interpolate(hills, size=(patch_px, patch_px), mode="bilinear")[:, 0]
+    return scene, hypothesis, T, K, torch.where(relief > 0.3, T[:, 2, 3, None, None] + 0.1 * relief, 0.0)
 
 
-def _differences(network: FlatNetwork, run: Callable[..., Outputs], patch_px: int) -> dict[str, float]:
+def _differences(network: FlatNetwork, run: Callable[..., Outputs], config: NetworkConfig) -> dict[str, float]:
     worst: dict[str, float] = {}
     for b in CHECKED_BATCHES:
-        inputs = random_pairs(b, patch_px, seed=b)
+        inputs = random_pairs(b, config.patch_px, seed=b, depth=config.sees_depth)
         with torch.no_grad():
             expected = network(*inputs)
         found = run(*inputs)
@@ -109,15 +117,14 @@ def _differences(network: FlatNetwork, run: Callable[..., Outputs], patch_px: in
     return worst
 
 
-def _onnx(network: FlatNetwork, patch_px: int, about: str) -> bytes:
+def _onnx(network: FlatNetwork, inputs: tuple[Tensor, ...], about: str) -> bytes:
     _require("onnx", "onnxscript", "onnxruntime")
-    inputs = random_pairs(2, patch_px, seed=0)
     names = OUTPUTS[: len(network(*inputs))]
     batch = torch.export.Dim("batch", min=1)
     with _quiet():
         program = torch.onnx.export(
-            network, inputs, input_names=list(INPUTS), output_names=list(names), opset_version=OPSET, dynamo=True,
-            dynamic_shapes=({0: batch},) * len(INPUTS), verbose=False,
+            network, inputs, input_names=list(INPUTS[: len(inputs)]), output_names=list(names), opset_version=OPSET,
+            dynamo=True, dynamic_shapes=({0: batch},) * len(inputs), verbose=False,
         )  # fmt: skip
     assert program is not None
     model = program.model_proto
@@ -133,18 +140,16 @@ def _onnx_runner(content: bytes) -> Callable[..., Outputs]:
     names = [output.name for output in session.get_outputs()]
 
     def run(*inputs: Tensor) -> Outputs:
-        fed = {name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=True)}
+        fed = {name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=False)}
         return dict(zip(names, session.run(None, fed), strict=True))
 
     return run
 
 
-def _program(network: FlatNetwork, patch_px: int, about: str) -> bytes:
+def _program(network: FlatNetwork, inputs: tuple[Tensor, ...], about: str) -> bytes:
     batch = torch.export.Dim("batch", min=1)
     with _quiet(), torch.no_grad():
-        program = torch.export.export(
-            network, random_pairs(2, patch_px, seed=0), dynamic_shapes=({0: batch},) * len(INPUTS)
-        )
+        program = torch.export.export(network, inputs, dynamic_shapes=({0: batch},) * len(inputs))
         buffer = io.BytesIO()
         torch.export.save(program, buffer, extra_files={"refinenet": about})
     return buffer.getvalue()

@@ -3,11 +3,30 @@
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 NEAR_M = 0.01
 """Depth under which `project` bends its divisor, so that points at or behind the camera stay finite."""
+
+
+class Flow(NamedTuple):
+    """Where points of a hypothesis' surface are seen in the scene.
+
+    Attributes:
+        p_cam_m: (b, n, 3) the points, camera frame.
+        uv_px: (b, n, 2) their projections, patch pixels.
+        on_object: (b, n) which of them lie on the surface; the others mean nothing.
+        offset_px: (b, n, 2) how far from there they are seen.
+        certainty: (b, n, 3) entries (uu, uv, vv) of the upper triangular matrices that errors of `offset_px` are
+            weighted with, 1 / px: what runs along an edge is known across it alone.
+    """
+
+    p_cam_m: Float[Tensor, "b n 3"]
+    uv_px: Float[Tensor, "b n 2"]
+    on_object: Bool[Tensor, "b n"]
+    offset_px: Float[Tensor, "b n 2"]
+    certainty: Float[Tensor, "b n 3"]
 
 
 class PoseUpdate(NamedTuple):
@@ -17,11 +36,13 @@ class PoseUpdate(NamedTuple):
         dR: (b, 3, 3) rotations.
         dt: (b, 3) translations, metres.
         confidence: (b,) logit of how well the hypothesis, before the update, fits; None from a network without it.
+        flow: What the update was worked out from, by a network that predicts that; else None.
     """
 
     dR: Float[Tensor, "b 3 3"]
     dt: Float[Tensor, "b 3"]
     confidence: Float[Tensor, " b"] | None = None
+    flow: Flow | None = None
 
 
 def rotation_from_6d(x: Float[Tensor, "b 6"]) -> Float[Tensor, "b 3 3"]:
@@ -56,6 +77,17 @@ def quat_wxyz_from_rotation(R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 4"]:
     w = 0.5 * torch.sqrt(torch.clamp(1 + R.diagonal(dim1=-2, dim2=-1).sum(-1), min=4e-8))
     axis = torch.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), dim=-1)
     return torch.nn.functional.normalize(torch.cat((w[:, None], axis / (4 * w[:, None])), dim=-1), dim=-1)
+
+
+def rotation_from_rotvec(rotvec: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
+    """Rotations by an axis times an angle in radians; twin of `posecore.se3.rotation_from_rotvec`."""
+    square = rotvec.square().sum(-1)[:, None, None] + 1e-12  # keeps the root's gradient at zero
+    angle = torch.sqrt(square)
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).reshape(-1, 3, 3)
+    unit = torch.eye(3, device=rotvec.device, dtype=rotvec.dtype)
+    return unit + torch.sin(angle) / angle * cross + (1 - torch.cos(angle)) / square * (cross @ cross)
 
 
 def rotation_angle_deg(R: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:

@@ -21,8 +21,9 @@ def forms(config: NetworkConfig) -> tuple[str, str]:
     )
 
 
-def start_linear(head: nn.Linear, bias: tuple[float, ...], std: float) -> None:
+def start_linear(head: nn.Linear | nn.Conv2d, bias: tuple[float, ...], std: float) -> None:
     """Weights of `std` around zero and a bias: a head that begins near one output."""
+    assert head.bias is not None
     nn.init.normal_(head.weight, std=std)
     with torch.no_grad():
         head.bias.copy_(torch.tensor(bias))

@@ -47,6 +47,7 @@ class PairArrays:
     hypothesis_contour_m: Float[Array, "b n 3"]
     scene_distance_px: Float[Array, "b p p"]
     hypothesis_distance_px: Float[Array, "b p p"]
+    hypothesis_depth_m: Float[Array, "b p p"] | None
     scene_bits: UInt8[Array, "b p p"]
     overlap: Float[Array, " b"] | None
     render_colours: Float[Array, "b 3 3"]
@@ -180,6 +181,7 @@ class PairMaker:
             hypothesis_contour_m=np.stack(points),
             scene_distance_px=np.stack([d.scene_distance_px for d in drafts]),
             hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
+            hypothesis_depth_m=depth[seen],
             scene_bits=scene_bits,
             overlap=visible_overlap(depth[seen] > 0, scene_bits),
             render_colours=render_colours,

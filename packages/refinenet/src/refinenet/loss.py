@@ -1,4 +1,4 @@
-"""Losses between a predicted pose update and the truth: contour, point and regression, all per sample."""
+"""Losses between a predicted pose update and the truth: contour, point, flow and regression, all per sample."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from refinenet import geometry
+from refinenet.flow import offsets_to_px, weighted
 from refinenet.geometry import PoseUpdate
 
 
@@ -122,13 +123,8 @@ def point_loss_px(
     Source: Labbe et al., CosyPose, ECCV 2020, and Simonelli et al., Disentangling Monocular 3D Object Detection.
     """
     predicted = geometry.apply_update(target.T_cam_obj_hypothesis, update)
-    points = objects.points_m[target.object_index]
-    T_true = target.T_cam_obj[:, None] @ objects.symmetries[target.object_index]
-    wanted = torch.einsum("bsij,bmj->bsmi", T_true[..., :3, :3], points)
-    got = points @ predicted[:, :3, :3].transpose(1, 2)
-    per_symmetry = (got[:, None] - wanted).abs().sum(-1).mean(-1)
-    rotation_m, twin = per_symmetry.masked_fill(~objects.valid[target.object_index], torch.inf).min(-1)
-    t_true = T_true[torch.arange(len(twin), device=twin.device), twin, :3, 3]
+    rotation_m, T_true = _nearest_twin(predicted, target, objects)
+    t_true = T_true[:, :3, 3]
 
     # Translations alone are compared at the true rotation: every model point moves alike, so one point stands for all.
     t = predicted[:, :3, 3]
@@ -140,6 +136,37 @@ def point_loss_px(
     return (rotation_weight * rotation_m + plane_m + depth_m) * px_per_m
 
 
+def _nearest_twin(
+    T_cam_obj: Float[Tensor, "b 4 4"], target: Target, objects: ObjectPoints
+) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 4 4"]]:
+    """The truth's symmetric twin whose rotation is nearest to a pose's: mean L1 distance of points, and its pose."""
+    points = objects.points_m[target.object_index]
+    T_true = target.T_cam_obj[:, None] @ objects.symmetries[target.object_index]
+    wanted = torch.einsum("bsij,bmj->bsmi", T_true[..., :3, :3], points)
+    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    per_symmetry = (got[:, None] - wanted).abs().sum(-1).mean(-1)
+    distance_m, twin = per_symmetry.masked_fill(~objects.valid[target.object_index], torch.inf).min(-1)
+    return distance_m, T_true[torch.arange(len(twin), device=twin.device), twin]
+
+
+def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
+    """Mean negative log likelihood of the true offsets of a hypothesis' visible surface, under `update.flow`.
+
+    Offsets err by a Laplace distribution of two dimensions whose scales the network says, so that what it cannot see,
+    as behind an occluder, costs little where it says so. The truth is the symmetric twin nearest to the hypothesis.
+    """
+    flow = update.flow
+    assert flow is not None
+    _, T_true = _nearest_twin(target.T_cam_obj_hypothesis, target, objects)
+    true_px = offsets_to_px(flow, target.T_cam_obj_hypothesis, T_true, target.K_crop)
+    error = weighted(flow.offset_px - true_px, flow.certainty)
+    length = torch.sqrt(error.square().sum(-1) + 1e-4)
+    cost = length - torch.log(flow.certainty[..., 0]) - torch.log(flow.certainty[..., 2])
+    # a cost without a bound, of a surface far from where it is thought to be, would drown all others
+    cost = torch.where(flow.on_object, cost.clamp(max=MOST_FLOW_COST), 0.0)
+    return cost.sum(-1) / flow.on_object.sum(-1).clamp(min=1)
+
+
 def confidence_loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
     """Cross-entropy of the confidence against the visible overlap of the hypothesis, which it was asked about."""
     assert update.confidence is not None and target.overlap is not None
@@ -148,7 +175,8 @@ def confidence_loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
     )
 
 
-LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
+LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
+MOST_FLOW_COST = 50.0
 
 
 def make_loss(
@@ -165,11 +193,15 @@ def make_loss(
     Args:
         name: which.
         gamma: weight of the translation in `mse`, per metre.
-        point_weight: weight of the point loss in `contour+point`.
+        point_weight: weight of the point loss in `contour+point` and `flow+point`.
         rotation_weight: weight of the rotation within the point loss.
         confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
         objects: model points, for the losses with `point` in their name.
     """
+
+    def flow(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+        assert objects is not None
+        return flow_loss(update, target, objects)
 
     def points(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
         assert objects is not None
@@ -181,6 +213,7 @@ def make_loss(
         "mse": lambda update, target: mse_loss(update, target, gamma),
         "point": points,
         "contour+point": lambda update, target: contour_loss_px(update, target) + point_weight * points(update, target),
+        "flow+point": lambda update, target: flow(update, target) + point_weight * points(update, target),
     }
     pose = table[name]
 

@@ -1,5 +1,6 @@
-"""PaperNet (frozen stems, late fusion), CompactNet (local matching, for two CPU cores) and PlusNet (for a GPU)."""
+"""The networks: PaperNet (frozen stems), CompactNet (matching, for two CPU cores), PlusNet (for a GPU), FlowNet."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -8,7 +9,9 @@ from torch import Tensor, nn
 
 from refinenet.backbone import ConvNorm, InceptionA, make_stem
 from refinenet.config import NetworkConfig
-from refinenet.geometry import PoseUpdate
+from refinenet.correlation import GradientCorrelation, LocalCorrelation
+from refinenet.flow import CELL_PX, surface_points, update_from_flow
+from refinenet.geometry import Flow, PoseUpdate
 from refinenet.heads import ROTATION_BIAS, forms, pose_update, start_linear
 
 
@@ -20,12 +23,18 @@ class Pair(NamedTuple):
         hypothesis_rgb: (b, 3, p, p) render of the object alone on black, same window.
         T_cam_obj: (b, 4, 4) the hypothesis, metres.
         K_crop: (b, 3, 3) intrinsics of the patch.
+        hypothesis_depth_m: (b, p, p) camera z of the render, 0 beside it; None for networks that do not ask for it.
     """
 
     scene_rgb: UInt8[Tensor, "b 3 p p"]
     hypothesis_rgb: UInt8[Tensor, "b 3 p p"]
     T_cam_obj: Float[Tensor, "b 4 4"]
     K_crop: Float[Tensor, "b 3 3"]
+    hypothesis_depth_m: Float[Tensor, "b p p"] | None = None
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Pair":
+        """Every field that is there, changed."""
+        return Pair(*(x if x is None else change(x) for x in self))  # type: ignore[arg-type]
 
 
 def normalised(rgb: UInt8[Tensor, "b 3 p p"]) -> Float[Tensor, "b 3 p p"]:
@@ -90,38 +99,6 @@ class PaperNet(nn.Module):
                 rotation.float(), translation.float(), pair.T_cam_obj, pair.K_crop, self.patch_px, crop=self.crop,
                 confidence=confidence,
             )  # fmt: skip
-
-
-class LocalCorrelation(nn.Module):
-    """How well each hypothesis cell matches the scene cells around it: (b, c, n, n) twice to (b, k*k, n/2, n/2).
-
-    Dot products of features over `sqrt(c)`, for every second hypothesis cell in both directions, with the scene cells
-    up to `radius` away; scene cells outside the patch match with 0.
-
-    Source: the correlation layer of FlowNet (Dosovitskiy et al., ICCV 2015).
-    """
-
-    def __init__(self, cells: int, radius: int) -> None:
-        super().__init__()
-        self.radius, self.side = radius, 2 * radius + 1
-        row, column = torch.meshgrid(torch.arange(0, cells, 2), torch.arange(0, cells, 2), indexing="ij")
-        down, right = torch.meshgrid(torch.arange(self.side), torch.arange(self.side), indexing="ij")
-        padded = cells + 2 * radius
-        where = (row.flatten()[:, None] + down.flatten()) * padded + column.flatten()[:, None] + right.flatten()
-        self.register_buffer("where", where[None], persistent=False)
-        self.where: Tensor
-
-    def forward(
-        self, hypothesis: Float[Tensor, "b c n n"], scene: Float[Tensor, "b c n n"]
-    ) -> Float[Tensor, "b k m m"]:
-        """Match features of both patches."""
-        b, c, n, _ = hypothesis.shape
-        r = self.radius
-        queries = hypothesis[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(b, -1, c)
-        keys = nn.functional.pad(scene, (r, r, r, r)).permute(0, 2, 3, 1).reshape(b, -1, c)
-        all_pairs = torch.bmm(queries, keys.transpose(1, 2)) * c**-0.5
-        near = all_pairs.gather(2, self.where.expand(b, -1, -1))
-        return near.reshape(b, n // 2, n // 2, -1).permute(0, 3, 1, 2)
 
 
 class CompactNet(nn.Module):
@@ -231,10 +208,97 @@ class PlusNet(CompactNet):
         )
 
 
-NETWORKS: dict[str, type[PaperNet] | type[CompactNet]] = {
+MOST_CERTAIN = 5.0
+"""Bound of the logarithm of a certainty, 1 / px, either way."""
+
+
+class FlowNet(nn.Module):
+    """Sees where each part of the hypothesis is in the scene, and how surely; the pose that fits that best follows.
+
+    The hypothesis comes with its depth, so every point that is seen elsewhere says something about the pose, and the
+    pose itself is solved for, not guessed: see `flow.update_from_flow`. Gradients are matched as they are
+    (`GradientCorrelation`), with learned features beside them; then an hourglass from a quarter of the patch's
+    resolution to a sixteenth and back.
+
+    Source: flow between render and image with the pose solved from it, as in PFA (Hu et al., ECCV 2022) and GenFlow
+    (Moon et al., CVPR 2024); certainties from a likelihood.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        wide, wider = config.widths
+        self.scene, self.hypothesis = self._encoder(3, config), self._encoder(5, config)
+        self.correlation = GradientCorrelation(config.match_radius)
+        self.appearance = nn.Conv2d(2 * config.encoder[1], config.appearance_channels, 1)
+        seen = self.correlation.channels + config.appearance_channels
+        self.fine = nn.Sequential(ConvNorm(seen, wide, 1), ConvNorm(wide, wide, 3, padding=1))
+        self.coarse, self.coarsest = self._down(wide, wider), self._down(wider, wider)
+        self.join_coarse = ConvNorm(2 * wider, wider, 3, padding=1)
+        self.join_fine = ConvNorm(wider + wide, wide, 3, padding=1)
+        self.head = nn.Conv2d(wide, 5, 3, padding=1)
+        start_linear(self.head, (0.0,) * 5, config.head_std)
+        self.confidence: nn.Linear | None = None
+        if config.confidence:
+            self.confidence = nn.Linear(wider, 1)
+            start_linear(self.confidence, (0.0,), config.head_std)
+        self.patch_px = config.patch_px
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+    @staticmethod
+    def _encoder(c_in: int, config: NetworkConfig) -> nn.Module:
+        """From a patch to cells."""
+        first, second = config.encoder
+        return nn.Sequential(
+            ConvNorm(c_in, first, 5, stride=2, padding=2), ConvNorm(first, second, 3, stride=2, padding=1)
+        )
+
+    @staticmethod
+    def _down(c_in: int, c_out: int) -> nn.Module:
+        return nn.Sequential(ConvNorm(c_in, c_out, 3, stride=2, padding=1), ConvNorm(c_out, c_out, 3, padding=1))
+
+    def _seen(
+        self, pair: Pair, depth_m: Float[Tensor, "b p p"], half_m: Float[Tensor, " b"]
+    ) -> tuple[Float[Tensor, "b 5 n n"], Float[Tensor, "b c m m"]]:
+        """Head outputs, and the coarsest features; runs in reduced precision under autocast."""
+        mask = (depth_m > 0).float()
+        relief = ((depth_m - pair.T_cam_obj[:, 2, 3, None, None]) / half_m[:, None, None]).clamp(-1.5, 1.5) * mask
+        render = torch.cat((normalised(pair.hypothesis_rgb), mask[:, None], relief[:, None]), 1)
+        scene = self.scene(normalised(pair.scene_rgb).contiguous(memory_format=torch.channels_last))
+        hypothesis = self.hypothesis(render.contiguous(memory_format=torch.channels_last))
+        appearance = self.appearance(torch.cat((scene, hypothesis), 1))
+        matches = self.correlation(pair.hypothesis_rgb, mask, pair.scene_rgb).to(appearance.dtype)
+        fine = self.fine(torch.cat((matches, appearance), 1).contiguous(memory_format=torch.channels_last))
+        coarse = self.coarse(fine)
+        coarsest = self.coarsest(coarse)
+        coarse = self.join_coarse(torch.cat((nn.functional.interpolate(coarsest, scale_factor=2.0), coarse), 1))
+        fine = self.join_fine(torch.cat((nn.functional.interpolate(coarse, scale_factor=2.0), fine), 1))
+        return self.head(fine), coarsest
+
+    def forward(self, pair: Pair) -> PoseUpdate:
+        """The update of each hypothesis."""
+        depth_m, T = pair.hypothesis_depth_m, pair.T_cam_obj
+        assert depth_m is not None  # every stream fills it where the config says `sees_depth`
+        half_m = 0.5 * self.patch_px / pair.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
+        seen, coarsest = self._seen(pair, depth_m, half_m)
+        with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit
+            x = seen.float().permute(0, 2, 3, 1).flatten(1, 2)
+            diagonal = torch.exp(x[..., 2:4].clamp(-MOST_CERTAIN, MOST_CERTAIN))
+            p_cam_m, uv_px, on_object = surface_points(depth_m, pair.K_crop)
+            flow = Flow(
+                p_cam_m, uv_px, on_object, offset_px=CELL_PX * x[..., :2],
+                certainty=torch.stack((diagonal[..., 0], x[..., 4], diagonal[..., 1]), -1),
+            )  # fmt: skip
+            update = update_from_flow(flow, T, pair.K_crop, half_m)
+            if self.confidence is not None:
+                update = update._replace(confidence=self.confidence(coarsest.float().mean((2, 3)))[:, 0])
+        return update
+
+
+NETWORKS: dict[str, type[PaperNet | CompactNet | FlowNet]] = {
     "paper": PaperNet,
     "compact": CompactNet,
     "plus": PlusNet,
+    "flow": FlowNet,
 }
 
 

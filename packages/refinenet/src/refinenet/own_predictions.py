@@ -128,7 +128,7 @@ class OwnPredictions:
     ) -> tuple[Batch, Int[Array, " s"]]:
         """The batch after one update of some rows, and those of them that could be looked at where they went."""
         chosen = torch.from_numpy(rows).to(batch.sample_ids.device)
-        pair = Pair(*(x[chosen] for x in batch.pair))
+        pair = batch.pair.mapped(lambda x: x[chosen])
         with torch.autocast(chosen.device.type, torch.bfloat16, enabled=self._reduced):
             update = network(pair)
         T = geometry.apply_update(pair.T_cam_obj, update).double().cpu().numpy()
@@ -139,13 +139,15 @@ class OwnPredictions:
             return batch, rows[:0]
         where = chosen[torch.from_numpy(looks.kept).to(chosen.device)]
         colours = None if batch.render_colours is None else batch.render_colours[rows[looks.kept]]
-        new = self._pairs(looks, Pair(*(x[where] for x in batch.pair)), batch.target.mapped(lambda x: x[where]), rng)
+        new = self._pairs(looks, batch.pair.mapped(lambda x: x[where]), batch.target.mapped(lambda x: x[where]), rng)
         new = new._replace(pair=new.pair._replace(hypothesis_rgb=_tinted(looks.rgb, colours).to(chosen.device)))
-        pairs = Pair(*(x.index_copy(0, where, y) for x, y in zip(batch.pair, new.pair, strict=True)))
-        old = batch.target
-        both = zip(old, new.target, strict=True)
-        fields = (x if x is None or y is None else x.index_copy(0, where, y) for x, y in both)
-        return batch._replace(pair=pairs, target=Target(*fields)), rows[looks.kept]  # type: ignore[arg-type]
+
+        def put(old: tuple[Tensor | None, ...], moved: tuple[Tensor | None, ...]) -> list[Tensor | None]:
+            both = zip(old, moved, strict=True)
+            return [x if x is None or y is None else x.index_copy(0, where, y) for x, y in both]
+
+        pairs, targets = Pair(*put(batch.pair, new.pair)), Target(*put(batch.target, new.target))  # type: ignore[arg-type]
+        return batch._replace(pair=pairs, target=targets), rows[looks.kept]
 
     def _look(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: Target) -> _Looks | None:
         """What poses look like through windows of their own; None where none of them can be seen."""
@@ -189,6 +191,7 @@ class OwnPredictions:
         new_pair = Pair(
             scene_rgb=(scene + 0.5).clamp(0, 255).byte(), hypothesis_rgb=pair.hypothesis_rgb,
             T_cam_obj=real(looks.T_cam_obj), K_crop=real(looks.K_crop),
+            hypothesis_depth_m=None if pair.hypothesis_depth_m is None else real(looks.depth_m),
         )  # fmt: skip
         new_target = target._replace(
             T_cam_obj_hypothesis=new_pair.T_cam_obj,

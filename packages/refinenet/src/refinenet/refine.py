@@ -91,6 +91,7 @@ class Refiner:
         self._iterations = iterations
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
+        self._sees_depth = loaded.provenance.config.network.sees_depth
         self._batch = batch
         self.viewer = Viewer(meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
@@ -268,6 +269,7 @@ class Refiner:
             hypothesis_rgb=self._tensor(views.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
             T_cam_obj=self._tensor(T[part].astype(np.float32)),
             K_crop=self._tensor(views.K_crop[part].astype(np.float32)),
+            hypothesis_depth_m=self._tensor(views.depth_m[part]) if self._sees_depth else None,
         )
         with torch.inference_mode():
             update: PoseUpdate = self._network(pair)
@@ -288,11 +290,11 @@ def _objects(requests: Sequence[Request]) -> Int[Array, " b"]:
 def _blank(loaded: Checkpoint) -> tuple[Views, Float[Array, "1 4 4"]]:
     """An empty view, to see what a network gives."""
     p = loaded.provenance.config.network.patch_px
-    black, off = np.zeros((1, p, p, 3), np.uint8), np.zeros((1, p, p), bool)
+    black, off, far = np.zeros((1, p, p, 3), np.uint8), np.zeros((1, p, p), bool), np.zeros((1, p, p), np.float32)
     K, T = np.array([[[p, 0, p / 2], [0, p, p / 2], [0, 0, 1.0]]]), np.eye(4)[None].copy()
     T[0, 2, 3] = 1.0
     views = Views(
-        failures=[None], rows=np.zeros(1, np.int64), K_crop=K, scene_rgb=black, hypothesis_rgb=black, mask=off,
+        failures=[None], rows=np.zeros(1, np.int64), K_crop=K, scene_rgb=black, hypothesis_rgb=black, depth_m=far,
         inside=off,
     )  # fmt: skip
     return views, T

@@ -50,9 +50,8 @@ def stored_pairs(
             other = samples[int(rng.integers(len(samples)))]
             behind = augment.backdrop(other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng)
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
-    overlap = None
-    if "hypothesis_depth_m" in samples[0]:
-        overlap = visible_overlap(stack("hypothesis_depth_m") > 0, stack("scene_mask"))
+    depth_m = stack("hypothesis_depth_m") if "hypothesis_depth_m" in samples[0] else None
+    overlap = None if depth_m is None else visible_overlap(depth_m > 0, stack("scene_mask"))
     scene_rgb, hypothesis_rgb, render_colours = augment.colour(scenes, stack("hypothesis_rgb"), augment_config, rngs[0])
     return PairArrays(
         scene_rgb=scene_rgb,
@@ -64,6 +63,7 @@ def stored_pairs(
         hypothesis_contour_m=stack("hypothesis_contour_cam_m")[:, thin],
         scene_distance_px=stack("scene_distance_px"),
         hypothesis_distance_px=stack("hypothesis_distance_px"),
+        hypothesis_depth_m=depth_m,
         scene_bits=stack("scene_mask"),
         overlap=overlap,
         render_colours=render_colours,

@@ -30,7 +30,7 @@ class Views:
         K_crop: Cameras of the patches.
         scene_rgb: Patches of the image, black outside of it.
         hypothesis_rgb: Renders on black in the same windows.
-        mask: Their silhouettes.
+        depth_m: Their camera z, 0 beside the object.
         inside: Patch pixels that lie in the image.
     """
 
@@ -39,8 +39,13 @@ class Views:
     K_crop: Float[Array, "s 3 3"]
     scene_rgb: UInt8[Array, "s p p 3"]
     hypothesis_rgb: UInt8[Array, "s p p 3"]
-    mask: Bool[Array, "s p p"]
+    depth_m: Float[Array, "s p p"]
     inside: Bool[Array, "s p p"]
+
+    @property
+    def mask(self) -> Bool[Array, "s p p"]:
+        """Silhouettes of the renders."""
+        return self.depth_m > 0
 
 
 class Viewer:
@@ -78,17 +83,18 @@ class Viewer:
             row: self._window(frame.K, T_cam_obj[row], int(obj_id[row])) for row in range(b) if failures[row] is None
         }
         K_crop = {row: crop_K(frame.K, window, p) for row, window in windows.items()}
-        rgb, mask, inside = np.zeros((b, p, p, 3), np.uint8), np.zeros((b, p, p), bool), np.zeros((b, p, p), bool)
+        rgb, depth_m = np.zeros((b, p, p, 3), np.uint8), np.zeros((b, p, p), np.float32)
+        inside = np.zeros((b, p, p), bool)
         drawable = np.array(sorted(windows), np.int64)
         for i in np.unique(obj_id[drawable]):
             rows = drawable[obj_id[drawable] == i]
             layers = self._rasteriser.render(int(i), np.stack([K_crop[int(r)] for r in rows]), T_cam_obj[rows], p, p)
-            rgb[rows], mask[rows] = layers.rgb, layers.mask
+            rgb[rows], depth_m[rows] = layers.rgb, layers.depth_m
         for row, window in windows.items():
             inside[row] = pixels_inside(window, p, width_px, height_px)
-            if not mask[row].any():
+            if not (depth_m[row] > 0).any():
                 failures[row] = f"its render at {T_cam_obj[row, 2, 3]:.3g} m covers no pixel"
-            elif not (mask[row] & inside[row]).any():
+            elif not ((depth_m[row] > 0) & inside[row]).any():
                 center = self._meshes[int(obj_id[row])].center_m
                 u, v = project(frame.K, (T_cam_obj[row, :3, :3] @ center + T_cam_obj[row, :3, 3])[None])[0]
                 failures[row] = f"it lies at ({u:.0f}, {v:.0f}) px, outside of the image of {width_px} x {height_px} px"
@@ -99,7 +105,7 @@ class Viewer:
             K_crop=np.array([K_crop[int(r)] for r in seen]).reshape(-1, 3, 3),
             scene_rgb=_stacked([cut_patch(frame.image, windows[int(r)], p) for r in seen], p),
             hypothesis_rgb=rgb[seen],
-            mask=mask[seen],
+            depth_m=depth_m[seen],
             inside=inside[seen],
         )
 

@@ -16,8 +16,8 @@ from refinenet.cli.options import FILE, quiet_option, verbose_option
 if TYPE_CHECKING:
     from rich.progress import TaskID
 
-PRESETS = ("paper", "compact", "plus")
-LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point")
+PRESETS = ("paper", "compact", "plus", "flow")
+LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 
 log = logging.getLogger(__name__)
 

@@ -1,0 +1,392 @@
+"""Preset `flow`: the pose that surface points ask for, its loss, and training, refining and exporting with it."""
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from posecore import se3
+from posecore.camera import back_project, crop_K
+from posecore.errors import ConfigError
+from posecore.raster import Rasteriser
+from posecore.window import diameter_window
+from refinenet import checkpoint, export, geometry, loss
+from refinenet.agreement import gradients
+from refinenet.config import load_config
+from refinenet.correlation import GradientCorrelation, directions, orientations
+from refinenet.data import PairSource
+from refinenet.flow import offsets_to_px, surface_points, update_from_flow
+from refinenet.geometry import Flow
+from refinenet.loss import ObjectPoints, Target
+from refinenet.methods import Status
+from refinenet.network import FlowNet, make_network
+from refinenet.own_predictions import OwnPredictions
+from refinenet.refine import Refiner
+from refinenet.trainer import Trainer
+from scipy.spatial.transform import Rotation
+from torch.autograd import gradcheck
+
+from .conftest import K, background
+from .test_train import small
+
+P = 96
+SURE = torch.tensor([1.0, 0.0, 1.0])
+
+
+def hypothesis_of(mesh, truth, angle_deg, seed=0):
+    """A hypothesis near a truth, its patch camera, and its render's depth."""
+    rng = np.random.default_rng(seed)
+    guess = se3.perturb(truth, np.deg2rad(angle_deg), 0.15 * mesh.diameter_m, rng)
+    window = diameter_window(K, guess, mesh.center_m, mesh.diameter_m, 1.3)
+    K_crop = crop_K(K, window, P)
+    with Rasteriser({1: mesh}) as rasteriser:
+        depth_m = rasteriser.render(1, K_crop, guess[None], P, P, rgb=False).depth_m[0]
+    return guess, K_crop, depth_m
+
+
+@pytest.fixture(scope="module")
+def scenes(mesh):
+    """Truths, hypotheses, cameras and depth, float64."""
+    truths = [
+        se3.make_T(se3.random_rotation(np.random.default_rng(i)), np.array([0.1 * (i - 1), 0.05, (5 + i) * 0.12]))
+        for i in range(4)
+    ]
+    rows = [(truth, *hypothesis_of(mesh, truth, 15, seed=i)) for i, truth in enumerate(truths)]
+    return [torch.from_numpy(np.stack(column).astype(np.float64)) for column in zip(*rows, strict=True)]
+
+
+def true_flow(truth, guess, K_crop, depth_m):
+    flow = Flow(*surface_points(depth_m, K_crop), torch.zeros(0), torch.zeros(0))
+    offsets = offsets_to_px(flow, guess, truth, K_crop)
+    return flow._replace(offset_px=offsets, certainty=SURE.double().expand(*offsets.shape[:2], 3))
+
+
+def solved(flow, guess, K_crop, mesh):
+    return update_from_flow(flow, guess, K_crop, torch.full((len(guess),), mesh.diameter_m / 2, dtype=guess.dtype))
+
+
+def off_by(update, truth, guess):
+    """Angle in degrees and distance in metres that is left of the way to the truth."""
+    after = geometry.apply_update(guess, update)
+    left = geometry.update_between(after, truth)
+    return geometry.rotation_angle_deg(left.dR), left.dt.norm(dim=-1)
+
+
+def test_surface_points_are_those_of_posecore(scenes):
+    _, _, K_crop, depth_m = scenes
+    points, uv_px, on_object = surface_points(depth_m, K_crop)
+    assert on_object.shape == (4, (P // 4) ** 2)
+    assert on_object.sum(1).min() > 60
+    assert not on_object.all()
+    for i in range(4):
+        rows, columns = np.divmod(np.flatnonzero(on_object[i]), P // 4)
+        at = np.stack([4 * columns + 2.5, 4 * rows + 2.5], -1)  # pixel 2 of four, at its centre
+        np.testing.assert_allclose(uv_px[i][on_object[i]], at)
+        z = depth_m[i].numpy()[4 * rows + 2, 4 * columns + 2]
+        np.testing.assert_allclose(points[i][on_object[i]], back_project(K_crop[i].numpy(), at, z), rtol=1e-9)
+
+
+def test_the_true_offsets_give_the_true_pose(scenes, mesh):
+    truth, guess, K_crop, _ = scenes
+    update = solved(true_flow(*scenes), guess, K_crop, mesh)
+    angle_deg, distance_m = off_by(update, truth, guess)
+    start_deg, start_m = off_by(geometry.update_between(guess, guess), truth, guess)
+    assert start_deg.min() > 10 and start_m.min() > 0.01
+    assert angle_deg.max() < 0.05
+    assert distance_m.max() < 5e-4
+
+
+def test_points_that_nobody_is_sure_of_do_not_count(scenes, mesh):
+    truth, guess, K_crop, _ = scenes
+    flow = true_flow(*scenes)
+    hidden = torch.arange(flow.offset_px.shape[1]) % 2 == 0
+    wrong = torch.where(hidden[:, None], flow.offset_px + torch.tensor([9.0, -7.0]), flow.offset_px)
+    unsure = torch.where(hidden[:, None], 1e-3 * flow.certainty, flow.certainty)
+    angle_deg, _ = off_by(solved(flow._replace(offset_px=wrong, certainty=unsure), guess, K_crop, mesh), truth, guess)
+    assert angle_deg.max() < 0.1
+    _, moved_m = off_by(solved(flow._replace(offset_px=wrong), guess, K_crop, mesh), truth, guess)
+    assert moved_m.min() > 2e-3  # sure of them, it goes elsewhere
+
+
+def test_along_an_edge_offsets_may_be_anything(scenes, mesh):
+    """Certain across diagonals of either direction alone, and wrong along them."""
+    truth, guess, K_crop, _ = scenes
+    flow = true_flow(*scenes)
+    n = flow.offset_px.shape[1]
+    across = torch.stack([torch.ones(n), (-1.0) ** torch.arange(n)], -1).double() / 2**0.5
+    along = torch.stack([-across[:, 1], across[:, 0]], -1)
+    rng = torch.Generator().manual_seed(0)
+    slid = flow.offset_px + 5 * torch.randn(4, n, 1, generator=rng, dtype=torch.float64) * along
+    # W with W^T W = across across^T: one row
+    certainty = torch.stack([across[:, 0], across[:, 1], torch.full((n,), 1e-4).double()], -1).expand(4, -1, -1)
+    angle_deg, distance_m = off_by(
+        solved(flow._replace(offset_px=slid, certainty=certainty), guess, K_crop, mesh), truth, guess
+    )
+    assert angle_deg.max() < 0.1
+    assert distance_m.max() < 1e-3
+
+
+def test_where_nothing_is_seen_the_pose_stays(scenes, mesh):
+    _, guess, K_crop, _ = scenes
+    flow = true_flow(*scenes)
+    update = solved(flow._replace(on_object=torch.zeros_like(flow.on_object)), guess, K_crop, mesh)
+    torch.testing.assert_close(update.dR, torch.eye(3).double().expand(4, 3, 3))
+    assert update.dt.abs().max() == 0
+
+
+def test_the_solution_has_true_gradients(scenes, mesh):
+    """With errors of the pose's own model (true offsets), where weights, which carry none, do not matter."""
+    _, guess, K_crop, _ = (x[:1] for x in scenes)
+    flow = true_flow(*(x[:1] for x in scenes))
+    some = flow.on_object[0].nonzero()[::8, 0]
+    flow = Flow(flow.p_cam_m[:, some], flow.uv_px[:, some], flow.on_object[:, some], flow.offset_px[:, some],
+                flow.certainty[:, some])  # fmt: skip
+    assert gradcheck(
+        lambda offsets: solved(flow._replace(offset_px=offsets), guess, K_crop, mesh).dt,
+        flow.offset_px.clone().requires_grad_(),
+        eps=1e-5,
+        atol=1e-4,
+    )
+
+
+def test_rotations_by_a_vector_are_posecores():
+    w = np.random.default_rng(2).normal(size=(20, 3))
+    w[0] = 0
+    found = geometry.rotation_from_rotvec(torch.from_numpy(w))
+    np.testing.assert_allclose(found, Rotation.from_rotvec(w).as_matrix(), atol=1e-9)
+
+
+def test_gradients_are_those_of_the_agreement():
+    """Away from weak edges, whose strength fades: twice the angle of the channel that changes most."""
+    rgb = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3)).astype(np.float32)
+    unit, strength = gradients(rgb)
+    planes = torch.from_numpy(rgb).permute(0, 3, 1, 2)
+    x, y = unit[..., 0], unit[..., 1]
+    weight = strength**2 / (strength**2 + 12.0**2)
+    twice = np.stack([(x * x - y * y) * weight, 2 * x * y * weight], 1)
+    cells = twice.reshape(2, 2, 16, 2, 16, 2).mean((3, 5))
+    np.testing.assert_allclose(orientations(planes, 12.0), cells, atol=1e-4)
+    grey = np.repeat(rgb.mean(-1, keepdims=True), 3, -1)
+    unit, strength = gradients(grey)
+    cells = (unit * (strength / np.sqrt(strength**2 + 24.0**2))[..., None]).reshape(2, 16, 2, 16, 2, 2).mean((2, 4))
+    np.testing.assert_allclose(directions(planes, 24.0), cells.transpose(0, 3, 1, 2), atol=1e-4)
+
+
+@pytest.mark.parametrize(("right", "down"), [(0, 0), (6, 2), (-4, 8), (10, -10)])
+def test_gradients_match_at_the_shift_that_was_made(mesh, right, down):
+    """Other colours and another light, a background: of all shifts the true one agrees best, of either kind."""
+    truth = se3.make_T(se3.random_rotation(np.random.default_rng(1)), np.array([0.0, 0.0, 6 * mesh.diameter_m]))
+    _, K_crop, _ = hypothesis_of(mesh, truth, 0)
+    with Rasteriser({1: mesh}) as rasteriser:
+        layers = rasteriser.render(1, K_crop, truth[None], P, P)
+    rgb, mask = layers.rgb[0], layers.mask[0]
+    brighter = (40 + 0.5 * rgb[..., ::-1]).astype(np.uint8)
+    scene = np.where(mask[..., None], brighter, np.uint8(128))
+    scene = np.roll(scene, (down, right), (0, 1))
+    correlation = GradientCorrelation(6)
+    found = correlation(*(torch.from_numpy(np.ascontiguousarray(x))[None] for x in (
+        rgb.transpose(2, 0, 1), mask.astype(np.float32), scene.transpose(2, 0, 1)
+    )))  # fmt: skip
+    assert found.shape == (1, correlation.channels, P // 4, P // 4)
+    orientation, direction = found[0, :-2].reshape(2, 13, 13, P // 4, P // 4)
+    amounts = found[0, -2:]
+    for volume, amount in ((orientation, amounts[0]), (direction, amounts[1])):
+        total = (volume * amount).sum((2, 3))
+        best = np.unravel_index(int(total.argmax()), (13, 13))
+        assert (best[1] - 6, best[0] - 6) == (right // 2, down // 2)
+        assert total.max() > 1.2 * total.flatten().sort().values[-10]
+    # cells where no edge of the render is agree with nothing
+    empty = amounts[0] == 0
+    assert empty.any()
+    assert orientation[:, :, empty].abs().max() == 0
+
+
+def targets(scenes):
+    truth, guess, K_crop, _ = scenes
+    none = torch.zeros(len(truth), 1, 3)
+    return Target(truth, guess, K_crop, none, none, none, none, torch.zeros(len(truth), dtype=torch.int64))
+
+
+def points_of(mesh, *symmetries):
+    every = np.stack([np.eye(4), *symmetries])
+    points = mesh.vertices_m[:: len(mesh.vertices_m) // 40][None]
+    return ObjectPoints(
+        torch.from_numpy(points), torch.from_numpy(every)[None], torch.ones(1, len(every), dtype=torch.bool)
+    )
+
+
+def test_the_flow_loss_is_least_at_the_truth_and_the_certainty_of_the_errors_size(scenes, mesh):
+    _, guess, K_crop, _ = scenes
+    target, objects = targets(scenes), points_of(mesh)
+    flow = true_flow(*scenes)
+
+    def cost(error_px, sure):
+        off = flow._replace(offset_px=flow.offset_px + error_px, certainty=sure * flow.certainty)
+        return loss.flow_loss(solved(off, guess, K_crop, mesh), target, objects)
+
+    noise = torch.randn(flow.offset_px.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    assert (cost(0.0, 1.0) < cost(0.3 * noise, 1.0)).all()
+    assert (cost(0.3 * noise, 1.0) < cost(noise, 1.0)).all()
+    # an error of about a pixel: neither ten times surer nor ten times less sure
+    assert (cost(noise, 1.5) < cost(noise, 15.0)).all()
+    assert (cost(noise, 1.5) < cost(noise, 0.15)).all()
+
+
+def test_the_flow_loss_takes_the_nearest_twin(scenes, mesh):
+    """A truth turned by a symmetry is as good."""
+    truth, guess, K_crop, _ = scenes
+    half_turn = se3.make_T(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    update = solved(true_flow(*scenes), guess, K_crop, mesh)
+    turned = targets(scenes)._replace(T_cam_obj=truth @ torch.from_numpy(half_turn))
+    near = loss.flow_loss(update, targets(scenes), points_of(mesh))
+    torch.testing.assert_close(loss.flow_loss(update, turned, points_of(mesh, half_turn)), near)
+    assert (loss.flow_loss(update, turned, points_of(mesh)) > near + 1).all()
+
+
+def flow_config(*overrides):
+    """Preset `flow`, as small as it gets."""
+    return small(
+        "loss.name=flow+point", "loss.point_weight=0.3", "network.kind=flow", "network.patch_px=64",
+        "network.encoder=[8,16]", "network.match_radius=4", "network.widths=[24,24]", "optimiser.gradient_clip=20",
+        *overrides,
+    )  # fmt: skip
+
+
+def batch_of(dataset, config, training=True, n=8):
+    source = PairSource(str(dataset), config, training=training)
+    rows = source.load([0])[0]
+    made = source.batch([(0, 0, i) for i in range(n)], [{k: v[i] for k, v in rows.items()} for i in range(n)])
+    source.close()
+    return made
+
+
+def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh):
+    fresh = batch_of(dataset, flow_config())
+    assert batch_of(dataset, small()).pair.hypothesis_depth_m is None
+    config = flow_config("own_predictions.share=1", "own_predictions.begin=0", "own_predictions.full=0")
+    network = make_network(config.network)
+    torch.nn.init.normal_(network.head.bias, std=0.1)
+    with OwnPredictions(config, {1: mesh}) as own:
+        moved = own(network, fresh, step=3)
+    assert not torch.equal(moved.pair.T_cam_obj, fresh.pair.T_cam_obj)
+    with Rasteriser({1: mesh}) as rasteriser:
+        for batch in (fresh, moved):
+            pair = batch.pair
+            layers = rasteriser.render(1, pair.K_crop.double().numpy(), pair.T_cam_obj.double().numpy(), 64, 64)
+            there = pair.hypothesis_depth_m.numpy()
+            assert ((there > 0) == layers.mask).mean() > 0.999
+            both = (there > 0) & layers.mask
+            np.testing.assert_allclose(there[both], layers.depth_m[both], atol=2e-3)
+
+
+def test_stored_pairs_have_their_depth_too(dataset):
+    pairs = batch_of(dataset, flow_config("hypothesis.fresh=false", "window.kind=fixed")).pair
+    mask = (pairs.hypothesis_rgb > 0).any(1)
+    assert ((pairs.hypothesis_depth_m > 0) == mask).float().mean() > 0.99
+
+
+@pytest.mark.slow
+def test_it_learns_where_points_went(dataset, tmp_path):
+    """A few steps on one batch: offsets come closer than those that nothing was learnt of, and the pose with them."""
+    trainer = Trainer(flow_config("optimiser.lr=0.003", "steps=150"), str(dataset), tmp_path)
+    batch = batch_of(dataset, trainer.config)
+    network = trainer.network
+
+    def error_px():
+        network.eval()
+        with torch.no_grad():
+            update = network(batch.pair)
+        true_px = offsets_to_px(update.flow, batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.pair.K_crop)
+        off = (update.flow.offset_px - true_px).norm(dim=-1)
+        left = geometry.update_between(geometry.apply_update(batch.pair.T_cam_obj, update), batch.target.T_cam_obj)
+        return float(off[update.flow.on_object].mean()), float(geometry.rotation_angle_deg(left.dR).mean())
+
+    before = error_px()
+    for _ in range(150):
+        trainer.take_step(batch)
+    after = error_px()
+    trainer.close()
+    assert before[0] > 2
+    assert after[0] < 0.4 * before[0]
+    assert after[1] < 0.5 * before[1]
+
+
+def test_every_weight_gets_a_gradient(dataset):
+    config = flow_config("network.confidence=true")
+    batch = batch_of(dataset, config)
+    network = make_network(config.network)
+    update = network(batch.pair)
+    value = loss.flow_loss(update, batch.target, points_of_dataset(dataset)) + loss.confidence_loss(
+        update, batch.target
+    )
+    value.mean().backward()
+    for name, weight in network.named_parameters():
+        assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
+        assert weight.grad.abs().sum() > 0, name
+
+
+def points_of_dataset(dataset):
+    from posecore.mesh import load_mesh
+
+    mesh = load_mesh(dataset / "models" / "obj_000001.ply", units="mm")
+    return ObjectPoints(*(x.float() if x.is_floating_point() else x for x in points_of(mesh)))
+
+
+@pytest.fixture(scope="module")
+def run(dataset, tmp_path_factory):
+    """A checkpoint of a network whose offsets are not zero."""
+    out = tmp_path_factory.mktemp("flow")
+    trainer = Trainer(flow_config("network.confidence=true"), str(dataset), out)
+    with torch.no_grad():
+        trainer.network.head.bias.copy_(torch.tensor([0.3, -0.2, 0.0, 0.0, 0.1]))
+    trainer.save(None)
+    trainer.close()
+    return checkpoint.load(out / "last.safetensors")
+
+
+def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
+    """Every point is seen 1.2 px to the right and 0.8 px up in the patch: so the object is."""
+    T = se3.make_T(se3.random_rotation(np.random.default_rng(3)), np.array([0.05, -0.02, 6 * mesh.diameter_m]))
+    image = background(np.random.default_rng(0))
+    with Refiner(run, {1: mesh}, iterations=1) as refiner:
+        found = refiner.refine(image, K, T, 1)
+    assert found.status is not Status.FAILED
+    px = diameter_window(K, T, mesh.center_m, mesh.diameter_m, run.provenance.config.window.scale).side_px / 64
+
+    def centre(pose):
+        at = K @ (pose[:3, :3] @ mesh.center_m + pose[:3, 3])
+        return at[:2] / at[2]
+
+    np.testing.assert_allclose(centre(found.T_cam_obj) - centre(T), [1.2 * px, -0.8 * px], atol=0.15 * px)
+    assert 0 <= found.confidence <= 1
+
+
+def test_onnx_and_program_give_its_updates(run, cli, tmp_path):
+    for name in ("model.onnx", "model.pt2"):
+        result = cli("export", "--checkpoint", run.path, "--out", tmp_path / name)
+        assert result.exit_code == 0, result.output
+    inputs = export.random_pairs(3, 64, seed=1, depth=True)
+    session = onnxruntime.InferenceSession(tmp_path / "model.onnx", providers=["CPUExecutionProvider"])
+    assert [one.name for one in session.get_inputs()] == list(export.INPUTS)
+    dR, dt, logit = session.run(None, {n: x.numpy() for n, x in zip(export.INPUTS, inputs, strict=True)})
+    with torch.no_grad():
+        update = export.FlatNetwork(run.network())(*inputs)
+    for found, expected in zip((dR, dt, logit), update, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert np.abs(dt).max() > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("preset", "override", "message"),
+    [
+        ("compact", "loss.name=flow+point", "kind compact predicts no flow"),
+        ("flow", "network.rotation=6d", "rotation and translation are outputs of heads"),
+        ("flow", "network.patch_px=72", "expected a multiple of 16 for kind=flow"),
+    ],
+)
+def test_settings_that_do_not_go_together(preset, override, message):
+    with pytest.raises(ConfigError, match=message):
+        load_config(preset, [override])
+
+
+def test_the_preset_is_a_flow_network():
+    assert isinstance(make_network(load_config("flow").network), FlowNet)
