@@ -7,9 +7,12 @@ import cv2
 import numpy as np
 import pytest
 from posecore import se3
-from posecore.camera import project
+from posecore.bop import Estimate, read_results, read_sidecar, write_results
+from posecore.camera import Camera, project
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from refinenet.baselines import search as search_module
+from refinenet.baselines.outcome import failed
 from refinenet.baselines.search import (
     APART,
     BEYOND_RAD,
@@ -29,10 +32,11 @@ from refinenet.baselines.search import (
 )
 from refinenet.baselines.sparse_views import sparse_views
 from refinenet.baselines.view import Target, look
-from refinenet.methods import Request, Status, make_baseline
+from refinenet.methods import Refinement, Request, Status, make_baseline
 
 from .conftest import K
 from .test_baselines import LMO_OBJECTS, distances, rendered_frame
+from .test_refine import make_bop
 
 
 def far_start(truth, seed):
@@ -82,6 +86,76 @@ def test_where_the_object_is_not_it_fails(tug, seen):
     agreement = re.search(r"agree with the image's by (0\.\d{3}) at most, 0\.4 needed", result.failure)
     assert agreement and 0.1 < float(agreement[1]) < 0.4, result.failure
     np.testing.assert_array_equal(result.T_cam_obj, start)
+
+
+class Given:
+    """Stands for a network: whatever it is asked, these poses are its answers, one after the other."""
+
+    name, needs_depth, settings = "given", False, {"preset": "given"}
+
+    def __init__(self, *poses):
+        self.poses, self.asked, self.closed = poses, [], False
+
+    def refine_batch(self, frame, requests):
+        self.asked += [request.T_cam_obj for request in requests]
+        poses = [self.poses[i % len(self.poses)] for i in range(len(requests))]
+        return [
+            Refinement(T_cam_obj=r.T_cam_obj, status=Status.FAILED, iterations=0, failure="none")
+            if pose is None
+            else Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=7, confidence=0.01)
+            for r, pose in zip(requests, poses, strict=True)
+        ]
+
+    def close(self):
+        self.closed = True
+
+
+def test_what_a_network_finds_is_taken_where_it_agrees_better(tug, seen, monkeypatch):
+    """Without edge ICP, which finds the truth here itself. One that errs or fails is not believed."""
+    monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
+    frame, truth, _, _ = seen
+    request = Request(obj_id=1, T_cam_obj=far_start(truth, 0))
+    wrong = se3.perturb(truth, np.deg2rad(30), 0.1 * tug.diameter_m, np.random.default_rng(0))
+    results = {}
+    for name, network in (("none", None), ("knows", Given(wrong, None, truth)), ("errs", Given(wrong, None))):
+        refiner = make_baseline("search", {1: tug}, 2, network)
+        (results[name],) = refiner.refine_batch(frame, [request])
+        if network is not None:
+            assert refiner.settings["network"] == {"preset": "given"}
+            assert 2 < len(network.asked) <= CANDIDATES + 2  # the start, the candidates, and the chosen one
+            np.testing.assert_array_equal(network.asked[0], request.T_cam_obj)
+        refiner.close()
+        assert network is None or network.closed
+    np.testing.assert_array_equal(results["errs"].T_cam_obj, results["none"].T_cam_obj)
+    off = {name: distances(tug, truth, result.T_cam_obj) for name, result in results.items()}
+    assert off["knows"] < 1e-6 < 0.01 < off["none"]
+    assert results["knows"].confidence > results["none"].confidence > 0.4
+    assert results["errs"].iterations > results["none"].iterations
+
+
+def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, repository, tmp_path):
+    frame, truth, _, _ = seen
+    camera = Camera(K=K, width_px=frame.image.shape[1], height_px=frame.image.shape[0])
+    make_bop(tmp_path / "bop", frame.image, camera, truth[None], tug)
+    start = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=far_start(truth, 0))]
+    write_results(tmp_path / "start.csv", start, {"dataset": str(tmp_path / "bop"), "method": "start"})
+    rest = ["--dataset", tmp_path / "bop", "--init", tmp_path / "start.csv", "--out", tmp_path / "x.csv", "--quiet"]
+    network = ["--checkpoint", repository / "examples" / "checkpoints" / "tug_compact.safetensors"]
+    result = cli("refine", "--method", "search", *network, *rest, "--iterations", 1, "--threads", 1)
+    assert result.exit_code == 0, result.output
+    sidecar = read_sidecar(tmp_path / "x.csv")
+    assert sidecar["method"] == "search with refinenet compact step 16000"
+    assert sidecar["checkpoint"] == "tug_compact.safetensors"
+    assert sidecar["settings"]["network"]["preset"] == "compact"
+    (found,) = read_results(tmp_path / "x.csv")
+    assert distances(tug, truth, found.T_cam_obj) < 0.1
+    for method, more, text in (
+        ("region", network, "--method region takes no --checkpoint"),
+        ("search", ["--hypotheses", 4], "--hypotheses is for --method network, search does without"),
+    ):
+        result = cli("refine", "--method", method, *more, *rest)
+        assert result.exit_code == 2
+        assert text in result.stderr
 
 
 @pytest.fixture(scope="module")

@@ -114,8 +114,15 @@ class PoseRefiner(Protocol):
         ...
 
 
-def make_baseline(name: str, meshes: Mapping[int, Mesh], iterations: int) -> PoseRefiner:
-    """A method of `BASELINES`."""
+WITH_NETWORK = ("search",)
+"""Those that a network makes more exact, where there is one."""
+
+
+def make_baseline(
+    name: str, meshes: Mapping[int, Mesh], iterations: int, network: PoseRefiner | None = None
+) -> PoseRefiner:
+    """A method of `BASELINES`; those of `WITH_NETWORK` also with a network, which is closed with it."""
     module, _, made = BASELINES[name].partition(":")
-    refiner: PoseRefiner = getattr(importlib.import_module(module), made)(meshes, iterations=iterations)
+    more = {} if network is None else {"network": network}
+    refiner: PoseRefiner = getattr(importlib.import_module(module), made)(meshes, iterations=iterations, **more)
     return refiner

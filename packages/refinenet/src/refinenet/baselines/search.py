@@ -5,12 +5,13 @@ nothing leads there from afar. So tens of thousands of poses are drawn around th
 them, ever closer, while an edge of the image counts from less and less far away. These spread orientations are those of
 LINE-2D (Hinterstoisser et al., PAMI 2012), in response maps made once for all poses; the draws are an evolution
 strategy. What agrees best is often not the truth, but the truth is mostly among the poses that agree well: edge ICP
-starts from several, and renders decide.
+starts from several, and a network as well where one is given, and renders decide.
 """
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -25,7 +26,7 @@ from refinenet.baselines.edge_icp import refine_by_edges
 from refinenet.baselines.outcome import Baseline, failed
 from refinenet.baselines.sparse_views import SparseViews, sparse_views
 from refinenet.baselines.view import Target, View, look
-from refinenet.methods import Frame, Refinement, Status
+from refinenet.methods import Frame, PoseRefiner, Refinement, Request, Status
 
 Array = np.ndarray
 ORIENTATIONS = 16
@@ -64,18 +65,27 @@ class GradientSearch(Baseline):
     Args:
         meshes: Objects by id.
         iterations: Of the edge ICP in the end.
+        network: Refines each candidate beside edge ICP; closed with this.
     """
 
     name = "search"
 
-    def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:
+    def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5, network: PoseRefiner | None = None) -> None:
         super().__init__(meshes, iterations=iterations)
+        self._network = network
         self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
         self._quick = Rasteriser(self._simple)
         self._views: dict[int, SparseViews] = {}
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """For the sidecar."""
+        return super().settings | ({} if self._network is None else {"network": self._network.settings})
+
     def close(self) -> None:
-        """Free what the renderers hold."""
+        """Free what the renderers hold, and close the network."""
+        if self._network is not None:
+            self._network.close()
         self._quick.close()
         super().close()
 
@@ -91,9 +101,12 @@ class GradientSearch(Baseline):
         quick = replace(target, rasteriser=self._quick)
         candidates = [start, *search(view, start, target.mesh, self._views[obj_id], rng)]
         tried = [self._followed(frame, pose, quick, TRIAL_ITERATIONS) for pose in candidates]
+        tried += self._by_network(frame, candidates, quick)
         scores = [_confidence(one) - LEASH * unlikely(start, one.T_cam_obj, target.mesh) for one in tried]
-        best = self._followed(frame, tried[int(np.argmax(scores))].T_cam_obj, target, self.iterations)
-        done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
+        chosen = tried[int(np.argmax(scores))].T_cam_obj
+        last = [self._followed(frame, chosen, target, self.iterations), *self._by_network(frame, [chosen], target)]
+        best = max(last, key=_confidence)
+        done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, *last))
         if _confidence(best) < MIN_AGREEMENT:
             why = f"gradients agree with the image's by {_confidence(best):.3f} at most, {MIN_AGREEMENT} needed"
             return failed(T_cam_obj, done, why)
@@ -108,6 +121,14 @@ class GradientSearch(Baseline):
             return replace(by_edges, confidence=at_edges)
         done = by_edges.iterations
         return Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=done, confidence=agreement)
+
+    def _by_network(self, frame: Frame, poses: Sequence[Float[Array, "4 4"]], target: Target) -> list[Refinement]:
+        """What the network makes of poses, if there is one, and how well that agrees."""
+        if self._network is None:
+            return []
+        requests = [Request(obj_id=target.obj_id, T_cam_obj=pose) for pose in poses]
+        found = [one for one in self._network.refine_batch(frame, requests) if not one.failed]
+        return [replace(one, confidence=agreement_of(frame, one.T_cam_obj, target)) for one in found]
 
 
 def _confidence(found: Refinement) -> float:

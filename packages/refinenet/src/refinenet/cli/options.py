@@ -1,5 +1,6 @@
 """What several commands' options have in common."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -12,7 +13,10 @@ method_option = click.option(
     "--method", type=click.Choice([NETWORK, *BASELINES]), default=NETWORK, help="What refines the poses."
 )
 checkpoint_option = click.option(
-    "--checkpoint", type=FILE, metavar="FILE", help="Trained network (.safetensors), for --method network."
+    "--checkpoint",
+    type=FILE,
+    metavar="FILE",
+    help="Trained network (.safetensors), for --method network; makes `refine --method search` more exact.",
 )
 device_option = click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", help="Where the network runs."
@@ -30,8 +34,8 @@ quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
 verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")
 
 
-def require_fit(method: str, checkpoint: Path | None) -> None:
-    """Refuse a network without a checkpoint, and a baseline with one."""
-    if (checkpoint is None) == (method == NETWORK):
+def require_fit(method: str, checkpoint: Path | None, with_network: Sequence[str] = ()) -> None:
+    """Refuse a network without a checkpoint, and a baseline with one that is not among `with_network`."""
+    if (checkpoint is None) == (method == NETWORK) and method not in with_network:
         needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
         raise click.UsageError(f"--method {method} {needs}")

@@ -20,7 +20,7 @@ from refinenet.cli.options import (
     threads_option,
     verbose_option,
 )
-from refinenet.methods import make_baseline
+from refinenet.methods import NETWORK, WITH_NETWORK, make_baseline
 
 if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
@@ -90,9 +90,12 @@ def refine(
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out ten.csv --iterations 10
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out pool.csv --hypotheses 16
     refinenet refine --method search --dataset lmo --init start.csv --out searched.csv
+    refinenet refine --method search --checkpoint flow.safetensors --dataset lmo --init start.csv --out both.csv
     """
     start_logging(verbose)
-    require_fit(method, checkpoint)
+    require_fit(method, checkpoint, WITH_NETWORK)
+    if hypotheses > 1 and method != NETWORK:
+        raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 
@@ -110,12 +113,14 @@ def refine(
     if not starts:
         raise ConfigError(f"{init}: no pose of object {', '.join(map(str, objects))}; change --object")
     meshes = {i: bop.mesh(i) for i in sorted({s.obj_id for s in starts})}
-    if loaded is None:
-        refiner: PoseRefiner = make_baseline(method, meshes, iterations)
-    else:
+    network: Refiner | None = None
+    if loaded is not None:
         network = Refiner(
             loaded, meshes, iterations=iterations, device=device, batch=batch, allow_other_mesh=allow_other_mesh
         )
+    if network is None or method != NETWORK:
+        refiner: PoseRefiner = make_baseline(method, meshes, iterations, network)
+    else:
         refiner = network if hypotheses == 1 else PooledRefiner(network, hypotheses, scorer, seed)
     try:
         with stoppable(out), progress_bar(quiet) as bar:
@@ -130,8 +135,9 @@ def refine(
             )
     finally:
         refiner.close()
+    own_name = refiner.name if network is None or method == NETWORK else f"{method} with {network.name}"
     sidecar = make_sidecar(
-        dataset=bop, method=refiner, name=name or refiner.name, loaded=loaded, start_path=init,
+        dataset=bop, method=refiner, name=name or own_name, loaded=loaded, start_path=init,
         start_sidecar=read_sidecar(init) or {}, refined=result,
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
