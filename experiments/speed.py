@@ -8,7 +8,7 @@ Weights do not matter for speed, so networks without a shipped checkpoint are tr
 mean nothing.
 
   --smoke  the shipped checkpoint, 2 images: a test of the plumbing
-  --small  the shipped checkpoint, presets paper and plus, and the baselines, 30 images
+  --small  the shipped checkpoint, presets paper, plus and flow, and the baselines, 30 images
   --full   the same with 200 images; a GPU
 
     python experiments/speed.py --small
@@ -30,7 +30,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     networks = {"compact": Network(checkpoint=SHIPPED)}
     if size != "smoke":
         networks["paper"] = Network(train=f"--preset paper --set backbone.pretrained=false {UNTRAINED}")
-        networks["plus"] = Network(train=f"--preset plus {UNTRAINED}")
+        networks |= {name: Network(train=f"--preset {name} {UNTRAINED}") for name in ("plus", "flow")}
     return compared(
         work,
         Comparison(
