@@ -24,7 +24,7 @@ def test_onnx_gives_the_networks_updates_at_any_batch_size(cli, loaded, tmp_path
     assert f"{out}: differs from the network by dR" in result.stdout
     session = onnxruntime.InferenceSession(out, providers=["CPUExecutionProvider"])
     inputs = export.random_pairs(7, 64, seed=3)
-    dR, dt = session.run(None, {n: x.numpy() for n, x in zip(export.INPUTS, inputs, strict=True)})[:2]
+    dR, dt = session.run(None, {n: x.numpy() for n, x in zip(export.INPUTS[:4], inputs, strict=True)})[:2]
     with torch.no_grad():
         update = loaded.network()(Pair(*inputs))
     np.testing.assert_allclose(dR, update.dR.numpy(), atol=1e-4)
@@ -70,7 +70,8 @@ def test_a_confidence_is_exported_where_there_is_one(tmp_path):
             level = pair.scene_rgb.float().mean(dim=(1, 2, 3)) - pair.hypothesis_rgb.float().mean(dim=(1, 2, 3))
             return PoseUpdate(pair.T_cam_obj[:, :3, :3], pair.T_cam_obj[:, :3, 3], level)
 
-    run = export._onnx_runner(export._onnx(export.FlatNetwork(Confident()).eval(), 64, "{}"))
+    content = export._onnx(export.FlatNetwork(Confident()).eval(), export.random_pairs(2, 64, seed=1), "{}")
+    run = export._onnx_runner(content)
     assert set(run(*export.random_pairs(2, 64, seed=0))) == set(export.OUTPUTS)
 
 

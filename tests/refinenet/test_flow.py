@@ -231,6 +231,33 @@ def test_the_flow_loss_is_least_at_the_truth_and_the_certainty_of_the_errors_siz
     assert (cost(noise, 1.5) < cost(noise, 0.15)).all()
 
 
+def test_the_flow_loss_has_true_gradients_also_behind_the_camera(scenes, mesh):
+    truth, guess, K_crop, depth_m = (x[:2] for x in scenes)
+    target, objects, flow = (
+        targets((truth, guess, K_crop, depth_m)),
+        points_of(mesh),
+        true_flow(*(x[:2] for x in scenes)),
+    )
+    few = flow.on_object.nonzero()[:, 1].unique()[::30]
+    rng = torch.Generator().manual_seed(2)
+    offsets = flow.offset_px[:, few] + torch.randn(2, len(few), 2, generator=rng, dtype=torch.float64)
+    certainty = torch.tensor([0.8, 0.3, 1.2], dtype=torch.float64).expand(2, len(few), 3).clone()
+    flow = Flow(flow.p_cam_m[:, few], flow.uv_px[:, few], flow.on_object[:, few], offsets, certainty)
+
+    def cost(offset_px, certainty, at=target):
+        seen = flow._replace(offset_px=offset_px, certainty=certainty)
+        return loss.flow_loss(geometry.update_between(guess, guess)._replace(flow=seen), at, objects)
+
+    leaves = offsets.requires_grad_(), certainty.requires_grad_()
+    assert gradcheck(cost, leaves, eps=1e-6, atol=1e-5)
+    behind = truth.clone()
+    behind[:, 2, 3] -= 2.0
+    value = cost(*leaves, at=target._replace(T_cam_obj=behind))
+    assert torch.isfinite(value).all()
+    assert value.max() <= loss.MOST_FLOW_COST
+    assert all(torch.isfinite(g).all() for g in torch.autograd.grad(value.sum(), leaves))
+
+
 def test_the_flow_loss_takes_the_nearest_twin(scenes, mesh):
     """A truth turned by a symmetry is as good."""
     truth, guess, K_crop, _ = scenes

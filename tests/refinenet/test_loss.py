@@ -11,6 +11,8 @@ from torch.autograd import gradcheck
 
 PATCH_PX = 128
 FOCAL_PX = 560.0
+OF_POSES = [name for name in loss.LOSSES if name != "flow+point"]
+"""The other one asks for more than a pose: see test_flow.py."""
 
 
 def make_target(mesh, rasteriser, pairs, seed=0):
@@ -116,7 +118,7 @@ def test_gradient_points_home(turned):
     assert cosine.mean() > 0.6
 
 
-@pytest.mark.parametrize("name", loss.LOSSES)
+@pytest.mark.parametrize("name", OF_POSES)
 def test_descent_on_each_loss_finds_the_pose(mesh, shifted, name):
     """Gradient descent on the update itself, in the parametrisation of the compact network."""
     chosen = loss.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
@@ -171,7 +173,7 @@ def test_outside_the_patch_the_distance_grows_with_the_way_back():
     assert (uv.grad.norm(dim=-1) > 0.99).all()
 
 
-@pytest.mark.parametrize("name", loss.LOSSES)
+@pytest.mark.parametrize("name", OF_POSES)
 def test_gradcheck(mesh, turned, name):
     few = turned.mapped(lambda x: x[:2])
     chosen = loss.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
@@ -190,7 +192,7 @@ def test_losses_stay_finite_behind_the_camera(mesh, turned):
     update = PoseUpdate(identity(turned).dR, torch.tensor([[0.0, 0.0, -2.0]], dtype=torch.float64).repeat(b, 1))
     for dt in (update.dt, -turned.T_cam_obj_hypothesis[:, :3, 3]):
         leaf = dt.clone().requires_grad_()
-        for name in loss.LOSSES:
+        for name in OF_POSES:
             chosen = loss.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
             values = chosen(PoseUpdate(update.dR, leaf), turned)
             (gradient,) = torch.autograd.grad(values.sum(), leaf)
