@@ -5,10 +5,10 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
+from refinenet.agreement import OUTLINE
+
 HALF_STRENGTH = {"render": 24.0, "scene": 12.0}
 """Gradients, in grey levels over two pixels, that count half: the image's edges are softened by lens and resampling."""
-OUTLINE = 255.0
-"""What the step from object to background counts as, whatever the object's colour."""
 WINDOW = 12
 """Side of the windows that are matched, in pixels."""
 LEAST_AMOUNT = 0.02

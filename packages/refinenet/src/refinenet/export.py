@@ -140,7 +140,7 @@ def _onnx_runner(content: bytes) -> Callable[..., Outputs]:
     names = [output.name for output in session.get_outputs()]
 
     def run(*inputs: Tensor) -> Outputs:
-        fed = {name: tensor.numpy() for name, tensor in zip(INPUTS, inputs, strict=False)}
+        fed = {name: tensor.numpy() for name, tensor in zip(INPUTS[: len(inputs)], inputs, strict=True)}
         return dict(zip(names, session.run(None, fed), strict=True))
 
     return run

@@ -30,7 +30,7 @@ class Baseline(ABC):
         iterations: Renders, each followed by an update, at every resolution or search range.
     """
 
-    name: ClassVar[str]
+    name: str
     needs_depth: ClassVar[bool] = False
 
     def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:

@@ -73,6 +73,8 @@ class GradientSearch(Baseline):
     def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5, network: PoseRefiner | None = None) -> None:
         super().__init__(meshes, iterations=iterations)
         self._network = network
+        if network is not None:
+            self.name = f"{self.name} with {network.name}"
         self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
         self._quick = Rasteriser(self._simple)
         self._views: dict[int, SparseViews] = {}

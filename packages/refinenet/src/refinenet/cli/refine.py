@@ -135,9 +135,8 @@ def refine(
             )
     finally:
         refiner.close()
-    own_name = refiner.name if network is None or method == NETWORK else f"{method} with {network.name}"
     sidecar = make_sidecar(
-        dataset=bop, method=refiner, name=name or own_name, loaded=loaded, start_path=init,
+        dataset=bop, method=refiner, name=name or refiner.name, loaded=loaded, start_path=init,
         start_sidecar=read_sidecar(init) or {}, refined=result,
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
