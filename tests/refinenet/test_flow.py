@@ -270,6 +270,59 @@ def test_the_flow_loss_takes_the_nearest_twin(scenes, mesh):
     assert (loss.flow_loss(update, turned, points_of(mesh)) > near + 1).all()
 
 
+def hypotheses_at(scenes, moves):
+    """The scenes' targets with hypotheses moved away from the truth, camera frame, about the object's origin."""
+    target = targets(scenes)
+    return target._replace(T_cam_obj_hypothesis=se3_moved(target.T_cam_obj, moves))
+
+
+def se3_moved(T, moves):
+    turned = T.clone()
+    turned[:, :3, :3] = torch.from_numpy(Rotation.from_rotvec(moves[0]).as_matrix()) @ T[:, :3, :3]
+    turned[:, :3, 3] += torch.tensor(moves[1], dtype=T.dtype)
+    return turned
+
+
+def test_closeness_is_one_at_the_truth_and_falls_with_what_is_seen_of_the_error(scenes, mesh):
+    points = points_of(mesh)
+    size_m = float((points.points_m.amax(1) - points.points_m.amin(1)).norm())
+    still = np.zeros(3)
+
+    def at(turn, move):
+        return loss.closeness(hypotheses_at(scenes, (turn, move)), points)
+
+    torch.testing.assert_close(at(still, still), torch.ones(4, dtype=torch.float64))
+    across = at(still, [loss.CLOSE * size_m, 0.0, 0.0])
+    np.testing.assert_allclose(across, np.exp(-1), rtol=0.05)  # nearer points move by more pixels
+    in_depth = at(still, [0.0, 0.0, loss.CLOSE * size_m])
+    assert (in_depth > 0.7).all()
+    turned = [at(np.deg2rad(angle) * np.array([0.0, 0.0, 1.0]), still) for angle in (5, 20, 60)]
+    assert (turned[0] > turned[1] + 0.1).all() and (turned[1] > 2 * turned[2]).all()
+
+
+def test_the_nearest_twin_is_as_close(scenes, mesh):
+    half_turn = se3.make_T(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    target = targets(scenes)
+    turned = target._replace(T_cam_obj_hypothesis=target.T_cam_obj @ torch.from_numpy(half_turn))
+    torch.testing.assert_close(loss.closeness(turned, points_of(mesh, half_turn)), torch.ones(4, dtype=torch.float64))
+    assert (loss.closeness(turned, points_of(mesh)) < 0.5).all()
+
+
+def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
+    """Cross-entropy is least for the confidence that says just that."""
+    target = targets(scenes)._replace(overlap=torch.full((4,), 0.25, dtype=torch.float64))
+    close = loss.closeness(target, points_of(mesh))
+    update = solved(true_flow(*scenes), scenes[1], scenes[2], mesh)
+    for name, wanted in (("overlap", target.overlap), ("closeness", close)):
+        cost = loss.make_loss(
+            "flow+point", gamma=1.0, point_weight=0.0, confidence_target=name, objects=points_of(mesh)
+        )
+        at = wanted.clamp(1e-6, 1 - 1e-6).logit().requires_grad_()
+        (slope,) = torch.autograd.grad(cost(update._replace(confidence=at), target).sum(), at)
+        np.testing.assert_allclose(slope, 0, atol=1e-6, err_msg=name)
+    assert (close - 0.25).abs().min() > 0.01
+
+
 def flow_config(*overrides):
     """Preset `flow`, as small as it gets."""
     return small(
@@ -342,10 +395,8 @@ def test_every_weight_gets_a_gradient(dataset):
     batch = batch_of(dataset, config)
     network = make_network(config.network)
     update = network(batch.pair)
-    value = loss.flow_loss(update, batch.target, points_of_dataset(dataset)) + loss.confidence_loss(
-        update, batch.target
-    )
-    value.mean().backward()
+    value = loss.flow_loss(update, batch.target, points_of_dataset(dataset))
+    (value + loss.confidence_loss(update, batch.target.overlap)).mean().backward()
     for name, weight in network.named_parameters():
         assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
         assert weight.grad.abs().sum() > 0, name

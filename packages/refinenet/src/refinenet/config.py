@@ -224,6 +224,8 @@ class LossConfig:
         model_points: model points of the point loss.
         symmetry_step_deg: step at which continuous symmetries are sampled for the point loss.
         confidence_weight: weight of the confidence's cross-entropy, for a network with that output.
+        confidence_target: what that output says of a hypothesis. `overlap`: how its silhouette fits what is visible of
+            the object. `closeness`: how near it is to the truth as the camera sees it, turns included.
     """
 
     name: Literal["contour", "contour-forward", "mse", "point", "contour+point", "flow+point"] = "contour"
@@ -234,6 +236,7 @@ class LossConfig:
     model_points: int = 64
     symmetry_step_deg: float = 10.0
     confidence_weight: float = 1.0
+    confidence_target: Literal["overlap", "closeness"] = "overlap"
 
 
 @dataclass(frozen=True, kw_only=True)

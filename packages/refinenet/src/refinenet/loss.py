@@ -167,16 +167,39 @@ def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Floa
     return cost.sum(-1) / flow.on_object.sum(-1).clamp(min=1)
 
 
-def confidence_loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
-    """Cross-entropy of the confidence against the visible overlap of the hypothesis, which it was asked about."""
-    assert update.confidence is not None and target.overlap is not None
-    return torch.nn.functional.binary_cross_entropy_with_logits(
-        update.confidence.float(), target.overlap, reduction="none"
+def closeness(target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
+    """How near hypotheses are to the truth as the camera sees it, in [0, 1]: 1 there, 1/e where model points are off
+    by `CLOSE` of the object's box diagonal in the mean, across the image. The nearest symmetric twin counts.
+    """
+    _, T_true = _nearest_twin(target.T_cam_obj_hypothesis, target, objects)
+    points_m = objects.points_m[target.object_index]
+    uv_px, true_px = (
+        geometry.project(target.K_crop, points_m @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3])
+        for T in (target.T_cam_obj_hypothesis, T_true)
     )
+    size_m = torch.linalg.vector_norm(points_m.amax(1) - points_m.amin(1), dim=-1)
+    size_px = size_m * target.K_crop[:, 0, 0] / T_true[:, 2, 3]
+    return torch.exp(-torch.linalg.vector_norm(uv_px - true_px, dim=-1).mean(-1) / (CLOSE * size_px))
+
+
+def wanted_confidence(name: str, target: Target, objects: ObjectPoints | None) -> Float[Tensor, " b"]:
+    """What a confidence is to say of hypotheses: their visible overlap, or their closeness."""
+    if name == "closeness":
+        assert objects is not None
+        return closeness(target, objects)
+    assert target.overlap is not None
+    return target.overlap
+
+
+def confidence_loss(update: PoseUpdate, wanted: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
+    """Cross-entropy of the confidence against how well the hypothesis fits, which it was asked about."""
+    assert update.confidence is not None
+    return torch.nn.functional.binary_cross_entropy_with_logits(update.confidence.float(), wanted, reduction="none")
 
 
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 MOST_FLOW_COST = 50.0
+CLOSE = 0.06
 
 
 def make_loss(
@@ -186,6 +209,7 @@ def make_loss(
     point_weight: float,
     rotation_weight: float = 1.0,
     confidence_weight: float = 1.0,
+    confidence_target: str = "overlap",
     objects: ObjectPoints | None,
 ) -> Callable[[PoseUpdate, Target], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
@@ -196,7 +220,8 @@ def make_loss(
         point_weight: weight of the point loss in `contour+point` and `flow+point`.
         rotation_weight: weight of the rotation within the point loss.
         confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
-        objects: model points, for the losses with `point` in their name.
+        confidence_target: what it is compared with, see `wanted_confidence`.
+        objects: model points, for the losses with `point` in their name, and for closeness.
     """
 
     def flow(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
@@ -219,6 +244,9 @@ def make_loss(
 
     def loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
         value = pose(update, target)
-        return value if update.confidence is None else value + confidence_weight * confidence_loss(update, target)
+        if update.confidence is None:
+            return value
+        wanted = wanted_confidence(confidence_target, target, objects)
+        return value + confidence_weight * confidence_loss(update, wanted)
 
     return loss

@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from refinenet import geometry
 from refinenet.data import Batch
-from refinenet.loss import ObjectPoints
+from refinenet.loss import ObjectPoints, wanted_confidence
 
 
 def pose_errors(
@@ -49,13 +49,17 @@ def pose_errors(
 
 @torch.no_grad()
 def measure(
-    network: nn.Module, batches: Iterable[Batch], objects: ObjectPoints, device: torch.device
+    network: nn.Module,
+    batches: Iterable[Batch],
+    objects: ObjectPoints,
+    device: torch.device,
+    confidence_target: str = "overlap",
 ) -> dict[str, float]:
     """Errors before and after one update: mean of each, and the rotation's median.
 
     Keys: validation/rotation_before_deg, validation/rotation_after_deg, validation/rotation_median_after_deg,
     validation/x_before_mm and so on; from a network with that output also validation/confidence_error, the mean
-    distance of its confidence from the visible overlap of each start.
+    distance of its confidence from what it is to say of each start.
     """
     was_training = network.training
     network.eval()
@@ -63,8 +67,9 @@ def measure(
     for batch in batches:
         batch = batch.to(device)
         start, update = batch.pair.T_cam_obj, network(batch.pair)
-        if update.confidence is not None and batch.target.overlap is not None:
-            off = (torch.sigmoid(update.confidence) - batch.target.overlap).abs()
+        if update.confidence is not None:
+            wanted = wanted_confidence(confidence_target, batch.target, objects)
+            off = (torch.sigmoid(update.confidence) - wanted).abs()
             collected.setdefault("validation/confidence_error", []).append(off.cpu())
         for when, pose in (("before", start), ("after", geometry.apply_update(start, update))):
             errors = pose_errors(pose, batch.target.T_cam_obj, batch.target.object_index, objects)

@@ -237,10 +237,11 @@ class FlowNet(nn.Module):
         self.join_fine = ConvNorm(wider + wide, wide, 3, padding=1)
         self.head = nn.Conv2d(wide, 5, 3, padding=1)
         start_linear(self.head, (0.0,) * 5, config.head_std)
-        self.confidence: nn.Linear | None = None
+        self.confidence: nn.Sequential | None = None
         if config.confidence:
-            self.confidence = nn.Linear(wider, 1)
-            start_linear(self.confidence, (0.0,), config.head_std)
+            last = nn.Linear(wider, 1)
+            start_linear(last, (0.0,), config.head_std)
+            self.confidence = nn.Sequential(nn.Linear(wider + wide, wider), nn.GELU(), last)
         self.patch_px = config.patch_px
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -258,8 +259,8 @@ class FlowNet(nn.Module):
 
     def _seen(
         self, pair: Pair, depth_m: Float[Tensor, "b p p"], half_m: Float[Tensor, " b"]
-    ) -> tuple[Float[Tensor, "b 5 n n"], Float[Tensor, "b c m m"]]:
-        """Head outputs, and the coarsest features; runs in reduced precision under autocast."""
+    ) -> tuple[Float[Tensor, "b 5 n n"], Float[Tensor, "b c"]]:
+        """Head outputs, and the features of the whole; runs in reduced precision under autocast."""
         mask = (depth_m > 0).float()
         relief = ((depth_m - pair.T_cam_obj[:, 2, 3, None, None]) / half_m[:, None, None]).clamp(-1.5, 1.5) * mask
         render = torch.cat((normalised(pair.hypothesis_rgb), mask[:, None], relief[:, None]), 1)
@@ -272,14 +273,14 @@ class FlowNet(nn.Module):
         coarsest = self.coarsest(coarse)
         coarse = self.join_coarse(torch.cat((nn.functional.interpolate(coarsest, scale_factor=2.0), coarse), 1))
         fine = self.join_fine(torch.cat((nn.functional.interpolate(coarse, scale_factor=2.0), fine), 1))
-        return self.head(fine), coarsest
+        return self.head(fine), torch.cat((coarsest.mean((2, 3)), fine.mean((2, 3))), 1)
 
     def forward(self, pair: Pair) -> PoseUpdate:
         """The update of each hypothesis."""
         depth_m, T = pair.hypothesis_depth_m, pair.T_cam_obj
         assert depth_m is not None  # every stream fills it where the config says `sees_depth`
         half_m = 0.5 * self.patch_px / pair.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
-        seen, coarsest = self._seen(pair, depth_m, half_m)
+        seen, whole = self._seen(pair, depth_m, half_m)
         with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit
             x = seen.float().permute(0, 2, 3, 1).flatten(1, 2)
             diagonal = torch.exp(x[..., 2:4].clamp(-MOST_CERTAIN, MOST_CERTAIN))
@@ -290,7 +291,7 @@ class FlowNet(nn.Module):
             )  # fmt: skip
             update = update_from_flow(flow, T, pair.K_crop, half_m)
             if self.confidence is not None:
-                update = update._replace(confidence=self.confidence(coarsest.float().mean((2, 3)))[:, 0])
+                update = update._replace(confidence=self.confidence(whole.float())[:, 0])
         return update
 
 

@@ -108,7 +108,7 @@ class Trainer:
         self._loss = make_loss(
             config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
             rotation_weight=config.loss.rotation_weight, confidence_weight=config.loss.confidence_weight,
-            objects=self.objects,
+            confidence_target=config.loss.confidence_target, objects=self.objects,
         )  # fmt: skip
         self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
         self._optimiser = make_optimiser(self.network, config.optimiser)
@@ -295,7 +295,7 @@ class Trainer:
 
     def validate(self) -> dict[str, float]:
         """Errors on held-out pairs, before and after one update; on rank 0."""
-        return metrics.measure(self.kept, self._held_out, self.objects, self.device)
+        return metrics.measure(self.kept, self._held_out, self.objects, self.device, self.config.loss.confidence_target)
 
     def save(self, errors: dict[str, float] | None) -> None:
         """Write `last`, and `best` when the errors are the best so far.
