@@ -168,8 +168,10 @@ def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Floa
 
 
 def closeness(target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
-    """How near hypotheses are to the truth as the camera sees it, in [0, 1]: 1 there, 1/e where model points are off
-    by `CLOSE` of the object's box diagonal in the mean, across the image. The nearest symmetric twin counts.
+    """How near hypotheses are to the truth as the camera sees it, in [0, 1]: 1 there, 1 / e `CLOSE` away.
+
+    What counts is the mean distance of projected model points, as a share of the object's box diagonal at the truth's
+    depth, to the nearest symmetric twin.
     """
     _, T_true = _nearest_twin(target.T_cam_obj_hypothesis, target, objects)
     points_m = objects.points_m[target.object_index]
