@@ -91,7 +91,7 @@ def test_where_the_object_is_not_it_fails(tug, seen):
 class Given:
     """Stands for a network: whatever it is asked, these poses are its answers, one after the other."""
 
-    name, needs_depth, settings = "given", False, {"preset": "given"}
+    name, needs_depth, settings, tells_closeness = "given", False, {"preset": "given"}, False
 
     def __init__(self, *poses):
         self.poses, self.asked, self.closed = poses, [], False
@@ -131,6 +131,47 @@ def test_what_a_network_finds_is_taken_where_it_agrees_better(tug, seen, monkeyp
     assert off["knows"] < 1e-6 < 0.01 < off["none"]
     assert results["knows"].confidence > results["none"].confidence > 0.4
     assert results["errs"].iterations > results["none"].iterations
+
+
+class Judge(Given):
+    """Stands for a network that leaves poses as they are, and says how close they are to one that it favours."""
+
+    tells_closeness = True
+
+    def refine_batch(self, frame, requests):
+        self.asked += [request.T_cam_obj for request in requests]
+        return [
+            Refinement(
+                T_cam_obj=r.T_cam_obj, status=Status.STOPPED, iterations=1,
+                confidence=max(float(np.abs(r.T_cam_obj - pose).max() < 1e-6) for pose in self.poses),
+            )
+            for r in requests
+        ]  # fmt: skip
+
+
+def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monkeypatch):
+    monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
+    frame, truth, _, _ = seen
+    request = Request(obj_id=1, T_cam_obj=far_start(truth, 0))
+
+    def found(network):
+        refiner = make_baseline("search", {1: tug}, 2, network)
+        (result,) = refiner.refine_batch(frame, [request])
+        refiner.close()
+        return result
+
+    plain = found(None)
+    asked = Judge(plain.T_cam_obj)
+    agreed = found(asked)
+    np.testing.assert_array_equal(agreed.T_cam_obj, plain.T_cam_obj)
+    assert agreed.confidence == pytest.approx((plain.confidence + 1) / 2)
+    other = max(asked.asked[1:], key=lambda pose: distances(tug, plain.T_cam_obj, pose))
+    against = found(Judge(other))
+    np.testing.assert_array_equal(against.T_cam_obj, other)
+    assert 0.5 < against.confidence < agreed.confidence
+    nowhere = found(Judge(np.zeros((4, 4))))
+    assert nowhere.failed
+    assert re.search(r"its fit is 0\.\d{3} at most, 0\.5 needed", nowhere.failure)
 
 
 def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, repository, tmp_path):

@@ -114,12 +114,21 @@ class PoseRefiner(Protocol):
         ...
 
 
+class NetworkRefiner(PoseRefiner, Protocol):
+    """A network as another method uses it."""
+
+    @property
+    def tells_closeness(self) -> bool:
+        """Whether its confidences were trained to say how near a pose is to the truth, turns included."""
+        ...
+
+
 WITH_NETWORK = ("search",)
 """Those that a network makes more exact, where there is one."""
 
 
 def make_baseline(
-    name: str, meshes: Mapping[int, Mesh], iterations: int, network: PoseRefiner | None = None
+    name: str, meshes: Mapping[int, Mesh], iterations: int, network: NetworkRefiner | None = None
 ) -> PoseRefiner:
     """A method of `BASELINES`; those of `WITH_NETWORK` also with a network, which is closed with it."""
     module, _, made = BASELINES[name].partition(":")

@@ -120,6 +120,11 @@ class Refiner:
         return f"refinenet {provenance.config.preset} step {provenance.step}"
 
     @property
+    def tells_closeness(self) -> bool:
+        """Whether confidences come from an output that was trained to say how near a pose is to the truth."""
+        return self.scorer == "learned" and self.checkpoint.provenance.config.loss.confidence_target == "closeness"
+
+    @property
     def settings(self) -> dict[str, Any]:
         """For the sidecar."""
         provenance = self.checkpoint.provenance

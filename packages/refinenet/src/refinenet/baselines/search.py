@@ -5,7 +5,7 @@ nothing leads there from afar. So tens of thousands of poses are drawn around th
 them, ever closer, while an edge of the image counts from less and less far away. These spread orientations are those of
 LINE-2D (Hinterstoisser et al., PAMI 2012), in response maps made once for all poses; the draws are an evolution
 strategy. What agrees best is often not the truth, but the truth is mostly among the poses that agree well: edge ICP
-starts from several, and a network as well where one is given, and renders decide.
+starts from several, a network follows where one is given, and renders decide, with the network where it was trained to.
 """
 
 import zlib
@@ -26,7 +26,7 @@ from refinenet.baselines.edge_icp import refine_by_edges
 from refinenet.baselines.outcome import Baseline, failed
 from refinenet.baselines.sparse_views import SparseViews, sparse_views
 from refinenet.baselines.view import Target, View, look
-from refinenet.methods import Frame, PoseRefiner, Refinement, Request, Status
+from refinenet.methods import Frame, NetworkRefiner, Refinement, Request, Status
 
 Array = np.ndarray
 ORIENTATIONS = 16
@@ -55,8 +55,9 @@ LEASH = 0.01
 """Agreement that a pose must have more for a standard deviation further from the start, squared."""
 BEYOND_RAD = 0.2
 """The standard deviation of angles beyond the largest that was drawn; under it, all are as likely."""
-MIN_AGREEMENT = 0.4
-"""Of gradients in the end, below which a pose is more likely wrong than right, and mostly worse than its start."""
+MIN_AGREEMENT, MIN_FIT = 0.4, 0.5
+"""In the end, below which a pose is more likely wrong than right, and mostly worse than its start: the agreement of
+gradients, or its mean with the closeness that a network tells."""
 
 
 class GradientSearch(Baseline):
@@ -65,16 +66,20 @@ class GradientSearch(Baseline):
     Args:
         meshes: Objects by id.
         iterations: Of the edge ICP in the end.
-        network: Refines each candidate beside edge ICP; closed with this.
+        network: Refines what edge ICP makes of each candidate; closed with this. One that tells closeness is asked
+            which of them is right as well, beside the agreement of gradients.
     """
 
     name = "search"
 
-    def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5, network: PoseRefiner | None = None) -> None:
+    def __init__(
+        self, meshes: Mapping[int, Mesh], *, iterations: int = 5, network: NetworkRefiner | None = None
+    ) -> None:
         super().__init__(meshes, iterations=iterations)
         self._network = network
         if network is not None:
             self.name = f"{self.name} with {network.name}"
+        self._judged = network is not None and network.tells_closeness
         self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
         self._quick = Rasteriser(self._simple)
         self._views: dict[int, SparseViews] = {}
@@ -102,16 +107,16 @@ class GradientSearch(Baseline):
         rng = np.random.default_rng([obj_id, zlib.crc32(start.tobytes())])
         quick = replace(target, rasteriser=self._quick)
         candidates = [start, *search(view, start, target.mesh, self._views[obj_id], rng)]
-        tried = [self._followed(frame, pose, quick, TRIAL_ITERATIONS) for pose in candidates]
-        tried += self._by_network(frame, candidates, quick)
+        tried = self._by_network(frame, [self._followed(frame, T, quick, TRIAL_ITERATIONS) for T in candidates], quick)
         scores = [_confidence(one) - LEASH * unlikely(start, one.T_cam_obj, target.mesh) for one in tried]
         chosen = tried[int(np.argmax(scores))].T_cam_obj
-        last = [self._followed(frame, chosen, target, self.iterations), *self._by_network(frame, [chosen], target)]
-        best = max(last, key=_confidence)
-        done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, *last))
-        if _confidence(best) < MIN_AGREEMENT:
-            why = f"gradients agree with the image's by {_confidence(best):.3f} at most, {MIN_AGREEMENT} needed"
-            return failed(T_cam_obj, done, why)
+        (best,) = self._by_network(frame, [self._followed(frame, chosen, target, self.iterations)], target)
+        done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
+        what, needed = (
+            ("its fit is", MIN_FIT) if self._judged else ("gradients agree with the image's by", MIN_AGREEMENT)
+        )
+        if _confidence(best) < needed:
+            return failed(T_cam_obj, done, f"{what} {_confidence(best):.3f} at most, {needed} needed")
         return replace(best, iterations=done)
 
     def _followed(self, frame: Frame, pose: Float[Array, "4 4"], target: Target, iterations: int) -> Refinement:
@@ -124,13 +129,19 @@ class GradientSearch(Baseline):
         done = by_edges.iterations
         return Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=done, confidence=agreement)
 
-    def _by_network(self, frame: Frame, poses: Sequence[Float[Array, "4 4"]], target: Target) -> list[Refinement]:
-        """What the network makes of poses, if there is one, and how well that agrees."""
+    def _by_network(self, frame: Frame, found: Sequence[Refinement], target: Target) -> list[Refinement]:
+        """What the network, if there is one, makes of poses: one that cannot judge only where that agrees more."""
         if self._network is None:
-            return []
-        requests = [Request(obj_id=target.obj_id, T_cam_obj=pose) for pose in poses]
-        found = [one for one in self._network.refine_batch(frame, requests) if not one.failed]
-        return [replace(one, confidence=agreement_of(frame, one.T_cam_obj, target)) for one in found]
+            return list(found)
+        requests = [Request(obj_id=target.obj_id, T_cam_obj=one.T_cam_obj) for one in found]
+        result = []
+        for before, after in zip(found, self._network.refine_batch(frame, requests), strict=True):
+            agreement = 0.0 if after.failed else agreement_of(frame, after.T_cam_obj, target)
+            fit = (agreement + _confidence(after)) / 2 if self._judged else agreement
+            best = after if (self._judged and not after.failed) or fit > _confidence(before) else before
+            confidence = fit if best is after else _confidence(before) / (2 if self._judged else 1)
+            result.append(replace(best, confidence=confidence, iterations=before.iterations + after.iterations))
+        return result
 
 
 def _confidence(found: Refinement) -> float:
