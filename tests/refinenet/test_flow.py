@@ -9,7 +9,7 @@ from posecore.camera import back_project, crop_K
 from posecore.errors import ConfigError
 from posecore.raster import Rasteriser
 from posecore.window import diameter_window
-from refinenet import checkpoint, export, geometry, loss
+from refinenet import checkpoint, export, geometry, loss, metrics
 from refinenet.agreement import gradients
 from refinenet.config import load_config
 from refinenet.correlation import GradientCorrelation, directions, orientations
@@ -436,6 +436,36 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
 
     np.testing.assert_allclose(centre(found.T_cam_obj) - centre(T), [1.2 * px, -0.8 * px], atol=0.15 * px)
     assert 0 <= found.confidence <= 1
+
+
+@pytest.mark.parametrize("target", ["overlap", "closeness"])
+def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target):
+    config = flow_config("network.confidence=true", "network.match_radius=1", f"loss.confidence_target={target}")
+    trainer = Trainer(config, str(dataset), tmp_path)
+    trainer.save(None)
+    trainer.close()
+    with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
+        assert refiner.scorer == "learned"
+        assert refiner.tells_closeness == (target == "closeness")
+
+
+class Unsure(torch.nn.Module):
+    """Leaves poses as they are and says of all that they are half right."""
+
+    def forward(self, pair):
+        b = len(pair.T_cam_obj)
+        return geometry.PoseUpdate(torch.eye(3).expand(b, 3, 3), torch.zeros(b, 3), torch.zeros(b))
+
+
+def test_validation_measures_the_confidence_against_what_it_is_to_say(dataset):
+    batch, points = batch_of(dataset, flow_config("network.confidence=true")), points_of_dataset(dataset)
+    errors = {}
+    for target in ("overlap", "closeness"):
+        found = metrics.measure(Unsure(), [batch], points, torch.device("cpu"), target)
+        errors[target] = found["validation/confidence_error"]
+        wanted = loss.wanted_confidence(target, batch.target, points)
+        assert errors[target] == pytest.approx(float((wanted - 0.5).abs().mean()), rel=1e-5)
+    assert abs(errors["overlap"] - errors["closeness"]) > 0.01
 
 
 def test_onnx_and_program_give_its_updates(run, cli, tmp_path):
