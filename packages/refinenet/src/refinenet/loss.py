@@ -202,6 +202,7 @@ def confidence_loss(update: PoseUpdate, wanted: Float[Tensor, " b"]) -> Float[Te
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 MOST_FLOW_COST = 50.0
 CLOSE = 0.06
+"""Share of the box diagonal at which closeness is 1 / e: a few pixels of a patch, within reach of the flow."""
 
 
 def make_loss(
