@@ -438,15 +438,17 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
     assert 0 <= found.confidence <= 1
 
 
-@pytest.mark.parametrize("target", ["overlap", "closeness"])
-def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target):
-    config = flow_config("network.confidence=true", "network.match_radius=1", f"loss.confidence_target={target}")
+@pytest.mark.parametrize(("target", "output"), [("overlap", True), ("closeness", True), ("closeness", False)])
+def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target, output):
+    config = flow_config(
+        f"network.confidence={str(output).lower()}", "network.match_radius=1", f"loss.confidence_target={target}"
+    )
     trainer = Trainer(config, str(dataset), tmp_path)
     trainer.save(None)
     trainer.close()
     with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
-        assert refiner.scorer == "learned"
-        assert refiner.tells_closeness == (target == "closeness")
+        assert refiner.scorer == ("learned" if output else "gradient")
+        assert refiner.tells_closeness == (output and target == "closeness")
 
 
 class Unsure(torch.nn.Module):

@@ -149,6 +149,12 @@ class Judge(Given):
         ]  # fmt: skip
 
 
+class Mover(Given):
+    """Stands for a network that judges, and is followed wherever it goes."""
+
+    tells_closeness = True
+
+
 def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monkeypatch):
     monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
     frame, truth, _, _ = seen
@@ -170,6 +176,13 @@ def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monke
     np.testing.assert_array_equal(against.T_cam_obj, other)
     assert 0.5 < against.confidence < agreed.confidence
     nowhere = found(Judge(np.zeros((4, 4))))
+    monkeypatch.setattr(search_module, "MIN_FIT", 0.0)
+    moved = found(Mover(far_start(truth, 3)))
+    np.testing.assert_array_equal(moved.T_cam_obj, far_start(truth, 3))
+    assert moved.confidence < plain.confidence
+    without = found(Mover(None))
+    np.testing.assert_array_equal(without.T_cam_obj, plain.T_cam_obj)
+    assert without.confidence == pytest.approx(plain.confidence / 2)
     assert nowhere.failed
     assert re.search(r"its fit is 0\.\d{3} at most, 0\.5 needed", nowhere.failure)
 
