@@ -7,10 +7,12 @@ a method that goes by what it sees errs in depth by as much.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
 from posecore.bop import BopDataset
+from posecore.errors import PoseError
 from posecore.raster import Rasteriser
 from refinenet.baselines.search import agreement_of
 from refinenet.baselines.view import Target
@@ -26,8 +28,11 @@ def main() -> None:
     parser.add_argument("dataset", type=Path, help="BOP dataset with ground truth")
     parser.add_argument("--visible", type=float, default=0.7, help="least visible share of an object")
     arguments = parser.parse_args()
-    bop = BopDataset(arguments.dataset)
-    meshes = {obj_id: bop.mesh(obj_id) for obj_id in bop.obj_ids}
+    try:
+        bop = BopDataset(arguments.dataset)
+        meshes = {obj_id: bop.mesh(obj_id) for obj_id in bop.obj_ids}
+    except PoseError as error:
+        sys.exit(str(error))
     curves, best_m = [], []
     with Rasteriser(meshes) as rasteriser:
         for scene_id, im_id in bop.target_images():
@@ -44,6 +49,8 @@ def main() -> None:
                 curve = [agreement_of(frame, T_cam_obj, target) for T_cam_obj in poses]
                 curves.append(curve)
                 best_m.append(np.expm1(STRETCH[int(np.argmax(curve))]) * centre_m[2] / mesh.diameter_m)
+    if not curves:
+        sys.exit(f"{arguments.dataset}: no annotated pose is known to be visible by {arguments.visible:g} or more")
     for stretch, agreement in zip(STRETCH, np.mean(curves, axis=0), strict=True):
         print(f"depth {100 * np.expm1(stretch):+.1f} %: mean agreement {agreement:.4f}")
     print(f"{len(curves)} poses; best {np.median(best_m):+.3f} diameters from the annotated depth in the median")
