@@ -3,11 +3,12 @@
 import json
 from collections import Counter
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from evalkit.cli import main
 from evalkit.perturb import PROTOCOLS, departures
-from posecore.bop import read_results, read_sidecar
+from posecore.bop import BopDataset, read_results, read_sidecar
 
 
 def perturb(*arguments):
@@ -65,3 +66,28 @@ def test_too_few_iterations_depart_from_the_papers_protocol():
 )
 def test_what_names_no_protocol_departs_from_none(sidecar):
     assert departures(sidecar) == []
+
+
+def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(dataset_path, tmp_path):
+    levels = ("--dataset", dataset_path, "--angles", "5", "--random-up-to", "10", "--random-translation", "0.2")
+    for name, more in (("plain", ()), ("stretched", ("--depth-stretch", "4"))):
+        assert perturb(*levels, "--out", tmp_path / f"{name}.csv", *more).exit_code == 0
+    dataset = BopDataset(dataset_path)
+    plain, stretched = (read_results(tmp_path / f"{name}.csv") for name in ("plain", "stretched"))
+    rows = read_sidecar(tmp_path / "stretched.csv")["perturbation"]["rows"]
+    assert len(plain) == len(stretched) == len(rows) == 12
+    for before, after, row in zip(plain, stretched, rows, strict=True):
+        truth = dataset.gt(before.scene_id, before.im_id)[row["gt_index"]].T_cam_obj
+        if not row["random"]:
+            assert np.array_equal(before.T_cam_obj, after.T_cam_obj)
+            continue
+        ray = truth[:3, 3] / np.linalg.norm(truth[:3, 3])
+        move, moved = (one.T_cam_obj[:3, 3] - truth[:3, 3] for one in (before, after))
+        assert moved @ ray == pytest.approx(4 * (move @ ray), abs=1e-8)
+        assert np.cross(moved, ray) == pytest.approx(np.cross(move, ray), abs=1e-8)
+        assert np.array_equal(before.T_cam_obj[:3, :3], after.T_cam_obj[:3, :3])
+        diameter_m = dataset.models_info[before.obj_id].diameter_m
+        assert row["translation_diameter"] == pytest.approx(np.linalg.norm(moved) / diameter_m, abs=1e-6)
+    without = perturb("--dataset", dataset_path, "--out", tmp_path / "x.csv", "--angles", "5", "--depth-stretch", "4")
+    assert without.exit_code == 2
+    assert without.stderr == "Error: --depth-stretch is for random starts; give --random-translation too\n"

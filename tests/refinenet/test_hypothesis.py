@@ -114,6 +114,25 @@ def test_stored_hypotheses_are_kept_without_fresh_ones(mesh, rasteriser, samples
         np.testing.assert_allclose(pairs.T_cam_obj_hypothesis[k], samples[i]["T_cam_obj_hypothesis"])
 
 
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0, 0), (0.5, 6, 26), (1.0, 32, 32)])
+def test_some_hypotheses_are_the_stored_ones(mesh, rasteriser, samples, share, least, most):
+    """Turned with their scenes; each belongs to its own truth all the same."""
+    stored = 0
+    for seed in range(4):
+        pairs = make_pairs(mesh, rasteriser, samples, seed, fresh=True, max_angle_deg=1.0, stored_share=share)
+        for k, i in enumerate(pairs.kept):
+            relative, given = (
+                se3.update_between(a, b)
+                for a, b in (
+                    (pairs.T_cam_obj[k], pairs.T_cam_obj_hypothesis[k]),
+                    (samples[i]["T_cam_obj"], samples[i]["T_cam_obj_hypothesis"]),
+                )
+            )
+            same = se3.rotation_angle_rad(relative[0]) == pytest.approx(se3.rotation_angle_rad(given[0]), abs=1e-6)
+            stored += same and np.linalg.norm(relative[1]) == pytest.approx(np.linalg.norm(given[1]), abs=1e-9)
+    assert least <= stored <= most
+
+
 def test_the_same_generators_make_the_same_pairs(mesh, rasteriser, samples):
     config = load_config("compact").augment
     first, again = (make_pairs(mesh, rasteriser, samples, 3, config, fresh=True) for _ in range(2))

@@ -164,6 +164,22 @@ def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
     torch.testing.assert_close(gradient, 2 * (0.5 - target.overlap))
 
 
+def test_what_is_far_off_teaches_the_confidence_alone(mesh, turned):
+    objects = object_points(mesh)
+    close = loss.closeness(turned, objects)
+    limit = float(close.median())
+    b = len(close)
+    still = identity(turned)._replace(confidence=torch.zeros(b, dtype=torch.float64))
+    settings = {"gamma": 1, "point_weight": 1, "confidence_target": "closeness", "objects": objects}
+    plain, limited = (loss.make_loss("point", **settings, min_closeness=least)(still, turned) for least in (0.0, limit))
+    alone = loss.confidence_loss(still, close)
+    far = close < limit
+    assert 0 < far.sum() < b
+    torch.testing.assert_close(limited[far].float(), alone[far].float())
+    torch.testing.assert_close(limited[~far], plain[~far])
+    assert (plain[far] > alone[far] + 0.1).all()
+
+
 def test_outside_the_patch_the_distance_grows_with_the_way_back():
     distance = torch.full((1, 8, 8), 2.0, dtype=torch.float64)
     uv = torch.tensor([[[-99.5, 4.0], [4.0, 107.5], [-2.5, -3.5]]], dtype=torch.float64, requires_grad=True)

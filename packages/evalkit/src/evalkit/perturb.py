@@ -1,7 +1,7 @@
 """Start poses from ground truth: rotated and moved by known amounts, so that convergence can be drawn as a curve."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,6 +80,7 @@ def perturb_dataset(
     levels: Sequence[Level],
     seed: int,
     random_up_to: Level | None = None,
+    depth_stretch: float = 1.0,
     protocol: str | None = None,
 ) -> int:
     """Write start poses for every target, and in the sidecar the level of every line.
@@ -93,6 +94,7 @@ def perturb_dataset(
         levels: levels for every target, one line each.
         seed: of all draws.
         random_up_to: where given, one more line for each target, its angle and length drawn evenly from 0 up to these.
+        depth_stretch: factor on the part of the random line's move along the viewing ray; its level is what comes out.
         protocol: name of the `PROTOCOLS` entry that the levels are of, for the sidecar.
 
     Returns:
@@ -113,9 +115,12 @@ def perturb_dataset(
             rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, truth.gt_index])
             drawn = [_drawn(random_up_to, rng)] if random_up_to else []
             for number, level in enumerate([*levels, *drawn]):
-                estimates.append(_start(target, truth, level, diameter_m, rng))
-                row = _sidecar_row(len(estimates) + 1, target, truth, level)
-                rows.append(row | {"random": number >= len(levels)})
+                random = number >= len(levels)
+                start = _start(target, truth, level, diameter_m, rng)
+                if random and depth_stretch != 1:
+                    start, level = _stretched(start, truth, level, diameter_m, depth_stretch)
+                estimates.append(start)
+                rows.append(_sidecar_row(len(estimates) + 1, target, truth, level) | {"random": random})
     sidecar = {
         "dataset": str(dataset.root.resolve()),
         "split": dataset.split,
@@ -142,6 +147,15 @@ def _start(target: Target, truth: GroundTruth, level: Level, diameter_m: float, 
         obj_id=target.obj_id,
         T_cam_obj=se3.perturb(truth.T_cam_obj, float(np.deg2rad(level.angle_deg)), distance_m, rng),
     )
+
+
+def _stretched(
+    start: Estimate, truth: GroundTruth, level: Level, diameter_m: float, factor: float
+) -> tuple[Estimate, Level]:
+    """The start with its depth error times a factor, and its level."""
+    T = se3.stretched_along_ray(truth.T_cam_obj, start.T_cam_obj, factor)
+    moved = float(np.linalg.norm(T[:3, 3] - truth.T_cam_obj[:3, 3])) / diameter_m
+    return replace(start, T_cam_obj=T), replace(level, translation_diameter=moved)
 
 
 def _sidecar_row(line: int, target: Target, truth: GroundTruth, level: Level) -> dict[str, Any]:

@@ -113,6 +113,15 @@ def perturb(
     return apply_update(T_cam_obj, dR, random_direction(rng) * distance_m)
 
 
+def stretched_along_ray(
+    T_cam_obj: Float[Array, "4 4"], moved: Float[Array, "4 4"], factor: float
+) -> Float[Array, "4 4"]:
+    """The moved pose with the part of its move along the ray from the camera to the object's origin times a factor."""
+    ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
+    along_m = (moved[:3, 3] - T_cam_obj[:3, 3]) @ ray
+    return make_T(moved[:3, :3], moved[:3, 3] + (factor - 1) * along_m * ray)
+
+
 def even_directions(count: int) -> Float[Array, "n 3"]:
     """Unit vectors evenly over the sphere, those of a Fibonacci lattice."""
     i = np.arange(count) + 0.5

@@ -126,6 +126,8 @@ class HypothesisConfig:
             times as far in depth as across the image.
         easy_share: share of samples whose angle is scaled down at random, and of those whose distance is,
             independently: what the later iterations of a refinement see.
+        stored_share: share of samples that take the shard's own hypothesis in place of a fresh one, as shards that
+            `synthgen cut` made of a detector's or a search's poses hold them.
         any_twin: draw around any of the poses that look like the truth, where the object has symmetries, as detectors
             give them. Which one it was cannot be seen; `mse` asks for it all the same, the other losses do not.
         in_plane: turn each scene about the optical axis by a random angle.
@@ -136,12 +138,14 @@ class HypothesisConfig:
     max_translation_diameter: float = 0.2
     depth_stretch: float = 1.0
     easy_share: float = 0.3
+    stored_share: float = 0.0
     any_twin: bool = False
     in_plane: bool = True
 
     def __post_init__(self) -> None:
         _require(0 < self.max_angle_deg <= 180, f"max_angle_deg is {self.max_angle_deg}, expected above 0 up to 180")
         _require(0 <= self.easy_share <= 1, f"easy_share is {self.easy_share}, expected 0 to 1")
+        _require(0 <= self.stored_share <= 1, f"stored_share is {self.stored_share}, expected 0 to 1")
         _require(
             0 <= self.max_translation_diameter <= 2,
             f"max_translation_diameter is {self.max_translation_diameter}, expected 0 to 2",
@@ -226,6 +230,8 @@ class LossConfig:
         confidence_weight: weight of the confidence's cross-entropy, for a network with that output.
         confidence_target: what that output says of a hypothesis. `overlap`: how its silhouette fits what is visible of
             the object. `closeness`: how near it is to the truth as the camera sees it, turns included.
+        min_closeness: hypotheses less close than this teach the confidence alone: what is too far off to be mended
+            would drown what can be; 0 leaves none out.
     """
 
     name: Literal["contour", "contour-forward", "mse", "point", "contour+point", "flow+point"] = "contour"
@@ -237,6 +243,10 @@ class LossConfig:
     symmetry_step_deg: float = 10.0
     confidence_weight: float = 1.0
     confidence_target: Literal["overlap", "closeness"] = "overlap"
+    min_closeness: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.min_closeness < 1, f"min_closeness is {self.min_closeness}, expected 0 to under 1")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -67,6 +67,11 @@ class PairSource:
     def __init__(self, url: str, config: TrainConfig, *, training: bool) -> None:
         self.reader = ShardReader(url)
         self._config = config
+        if config.window.kind == "fixed" and self.reader.card.get("cut", {}).get("window") == "diameter":
+            raise ConfigError(
+                f"{url}: windows follow the distance, and preset {config.preset} looks through windows of one side; "
+                "cut pairs with --set window=fixed"
+            )
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()
         self._cache: dict[int, dict[str, Array]] = {}
@@ -150,8 +155,8 @@ def _bytes(arrays: dict[str, Array]) -> int:
 
 
 def _steady(config: TrainConfig) -> HypothesisConfig:
-    """Hypotheses for validation: over the whole range, scenes as they are."""
-    return replace(config.hypothesis, easy_share=0.0, in_plane=False)
+    """Hypotheses for validation: over the whole range, none of the stored ones beside them, scenes as they are."""
+    return replace(config.hypothesis, easy_share=0.0, stored_share=0.0, in_plane=False)
 
 
 def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: dict[int, int]) -> Batch:

@@ -101,11 +101,7 @@ def draw_hypothesis(
     angle_rad = np.deg2rad(config.max_angle_deg) * reach * turn * rng.random()
     distance_m = config.max_translation_diameter * diameter_m * reach * move * rng.random()
     drawn = se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
-    if config.depth_stretch != 1:
-        ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
-        along_m = (drawn[:3, 3] - T_cam_obj[:3, 3]) @ ray
-        drawn[:3, 3] += (config.depth_stretch - 1) * along_m * ray
-    return drawn
+    return drawn if config.depth_stretch == 1 else se3.stretched_along_ray(T_cam_obj, drawn, config.depth_stretch)
 
 
 class PairMaker:
@@ -118,7 +114,7 @@ class PairMaker:
         window: How windows are cut.
         fixed_sides_px: Side of each object's window in the full image, for windows of fixed side.
         contour_points: Contour points of each patch.
-        hypothesis: How hypotheses are drawn; with `fresh` off, the stored ones are taken.
+        hypothesis: How hypotheses are drawn; with `fresh` off the stored ones are taken, else by `stored_share`.
         augment_config: Colour augmentation.
         symmetries: Transforms of each object that leave it as it is, for `hypothesis.any_twin`.
     """
@@ -151,7 +147,7 @@ class PairMaker:
 
         Args:
             samples: Rows of a shard: scene_rgb, scene_mask, scene_contour_cam_m, T_cam_obj, K, window_px, obj_id and,
-                without fresh hypotheses, T_cam_obj_hypothesis.
+                where it is to be taken, T_cam_obj_hypothesis.
             rngs: As many.
         """
         drafts = [d for i, (s, rng) in enumerate(zip(samples, rngs, strict=True)) if (d := self._draft(i, s, rng))]
@@ -198,8 +194,10 @@ class PairMaker:
         truth = T_turn @ sample["T_cam_obj"]
         x0, y0, side = (float(v) for v in sample["window_px"])
         stored, stored_px = Window(x0_px=x0, y0_px=y0, side_px=side), len(sample["scene_rgb"])
+        share = self._hypothesis.stored_share
+        stored_first = not self._hypothesis.fresh or (share > 0 and rng.random() < share)
         for attempt in range(ATTEMPTS):
-            if self._hypothesis.fresh:
+            if self._hypothesis.fresh and not (stored_first and attempt == 0):
                 around = self._twin(truth, int(sample["obj_id"]), rng) if self._hypothesis.any_twin else truth
                 guess = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
             else:

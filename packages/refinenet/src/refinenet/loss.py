@@ -213,6 +213,7 @@ def make_loss(
     rotation_weight: float = 1.0,
     confidence_weight: float = 1.0,
     confidence_target: str = "overlap",
+    min_closeness: float = 0.0,
     objects: ObjectPoints | None,
 ) -> Callable[[PoseUpdate, Target], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
@@ -224,6 +225,7 @@ def make_loss(
         rotation_weight: weight of the rotation within the point loss.
         confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
         confidence_target: what it is compared with, see `wanted_confidence`.
+        min_closeness: hypotheses less close to the truth have no part in the loss but for their confidence.
         objects: model points, for the losses with `point` in their name, and for closeness.
     """
 
@@ -247,6 +249,9 @@ def make_loss(
 
     def loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
         value = pose(update, target)
+        if min_closeness > 0:
+            assert objects is not None
+            value = torch.where(closeness(target, objects) >= min_closeness, value, 0.0)
         if update.confidence is None:
             return value
         wanted = wanted_confidence(confidence_target, target, objects)

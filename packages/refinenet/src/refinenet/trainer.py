@@ -108,7 +108,8 @@ class Trainer:
         self._loss = make_loss(
             config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
             rotation_weight=config.loss.rotation_weight, confidence_weight=config.loss.confidence_weight,
-            confidence_target=config.loss.confidence_target, objects=self.objects,
+            confidence_target=config.loss.confidence_target, min_closeness=config.loss.min_closeness,
+            objects=self.objects,
         )  # fmt: skip
         self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
         self._optimiser = make_optimiser(self.network, config.optimiser)

@@ -24,6 +24,13 @@ from evalkit.cli.options import FOLDER, NEW_FILE, Numbers, split_option
     type=click.FloatRange(0),
     help="The random start is moved by 0 to this, object diameters. Default: 0.",
 )
+@click.option(
+    "--depth-stretch",
+    type=click.FloatRange(1, 20),
+    default=1.0,
+    show_default=True,
+    help="Factor on the random start's move along the viewing ray: detectors that see RGB alone err most in depth.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all draws.")
 def perturb(
     dataset: Path,
@@ -34,6 +41,7 @@ def perturb(
     translations: tuple[float, ...],
     random_up_to: float | None,
     random_translation: float | None,
+    depth_stretch: float,
     seed: int,
 ) -> None:
     """Write start poses: ground truth rotated and moved by known amounts.
@@ -43,6 +51,7 @@ def perturb(
     \b
     Examples:
       evalkit perturb --dataset lmo --out start.csv --random-up-to 20 --random-translation 0.2
+      evalkit perturb --dataset lmo --out start.csv --random-up-to 60 --random-translation 0.3 --depth-stretch 6
       evalkit perturb --dataset lmo --out curve.csv --angles 5,10,15,30,45 --translations 0.1,0.5,1
       evalkit perturb --dataset lm --out curve.csv --protocol paper
     """
@@ -59,12 +68,15 @@ def perturb(
     limit = None
     if random_up_to is not None or random_translation is not None:
         limit = Level(angle_deg=random_up_to or 0.0, translation_diameter=random_translation or 0.0)
+    if depth_stretch != 1 and not random_translation:
+        raise ConfigError("--depth-stretch is for random starts; give --random-translation too")
     count = perturb_dataset(
         BopDataset(dataset, split),
         out,
         levels=levels_of(angles, translations),
         seed=seed,
         random_up_to=limit,
+        depth_stretch=depth_stretch,
         protocol=protocol,
     )
     click.echo(f"{count} start poses: {out}")
