@@ -184,6 +184,8 @@ def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monke
     np.testing.assert_array_equal(without.T_cam_obj, plain.T_cam_obj)
     assert without.confidence == pytest.approx(plain.confidence / 2)
     assert nowhere.failed
+    assert len(nowhere.tried) == len(asked.asked)
+    assert max(one.confidence for one in nowhere.tried) < 0.5
     assert re.search(r"its fit is 0\.\d{3} at most, 0\.5 needed", nowhere.failure)
 
 
@@ -203,7 +205,15 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
     assert sidecar["settings"]["network"]["preset"] == "compact"
     (found,) = read_results(tmp_path / "x.csv")
     assert distances(tug, truth, found.T_cam_obj) < 0.1
+    candidates = ["--candidates", tmp_path / "all.csv", "--keep-failed"]
+    assert cli("refine", "--method", "search", *candidates, *rest, "--iterations", 1).exit_code == 0
+    weighed, (kept,) = read_results(tmp_path / "all.csv"), read_results(tmp_path / "x.csv")
+    assert 2 < len(weighed) <= CANDIDATES + 2
+    assert {(one.scene_id, one.im_id, one.obj_id) for one in weighed} == {(1, 0, 1)}
+    np.testing.assert_array_equal(weighed[-1].T_cam_obj, kept.T_cam_obj)
+    assert weighed[-1].score == kept.score > np.median([one.score for one in weighed])
     for method, more, text in (
+        ("edge-icp", candidates, "--candidates is for --method search, edge-icp follows one pose"),
         ("region", network, "--method region takes no --checkpoint"),
         ("search", ["--hypotheses", 4], "--hypotheses is for --method network, search does without"),
     ):

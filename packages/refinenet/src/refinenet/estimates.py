@@ -32,12 +32,14 @@ class Refined:
         start_lines: Line in the start file of each of them.
         failures: Why poses failed, by their line in the start file.
         converged: How many stopped on a small update.
+        tried: Every pose that the method weighed, of all start poses, those that failed too.
     """
 
     estimates: list[Estimate]
     start_lines: list[int]
     failures: dict[int, str] = field(default_factory=dict)
     converged: int = 0
+    tried: list[Estimate] = field(default_factory=list)
 
 
 def refine_estimates(
@@ -97,6 +99,7 @@ def refine_estimates(
         estimates=[_estimate(start, result, taken_s) for start, result, taken_s in kept],
         start_lines=[start.line for start, _, _ in kept],
         failures={start.line: result.failure or "" for start, result, _ in pairs if result.failed},
+        tried=[_estimate(start, one, taken_s) for start, result, taken_s in pairs for one in result.tried],
         converged=sum(result.status is Status.CONVERGED for _, result, _ in kept),
     )
 

@@ -115,9 +115,11 @@ class GradientSearch(Baseline):
         what, needed = (
             ("its fit is", MIN_FIT) if self._judged else ("gradients agree with the image's by", MIN_AGREEMENT)
         )
+        weighed = (*tried, best)
         if _confidence(best) < needed:
-            return failed(T_cam_obj, done, f"{what} {_confidence(best):.3f} at most, {needed} needed")
-        return replace(best, iterations=done)
+            why = f"{what} {_confidence(best):.3f} at most, {needed} needed"
+            return replace(failed(T_cam_obj, done, why), tried=weighed)
+        return replace(best, iterations=done, tried=weighed)
 
     def _followed(self, frame: Frame, pose: Float[Array, "4 4"], target: Target, iterations: int) -> Refinement:
         """A pose, or what edge ICP makes of it where that agrees better."""

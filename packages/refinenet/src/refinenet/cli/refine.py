@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
 
 SHOWN_FAILURES = 5
+SEARCH = "search"
 
 
 @click.command()
@@ -51,6 +52,10 @@ SHOWN_FAILURES = 5
 @click.option("--keep-failed", is_flag=True, help="Write the start pose of one that fails, with score 0. [left out]")
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
 @click.option("--overlay", type=FILE, metavar="DIR", help="Draw start (red) and refined (green) contours here.")
+@click.option(
+    "--candidates", type=NEW_FILE, metavar="CSV",
+    help="Also write every pose that --method search weighed, with its score: hypotheses for synthgen cut.",
+)  # fmt: skip
 @device_option
 @click.option("--batch", type=click.IntRange(1), default=64, help="Most poses in one forward pass.")
 @threads_option
@@ -72,6 +77,7 @@ def refine(
     keep_failed: bool,
     name: str | None,
     overlay: Path | None,
+    candidates: Path | None,
     device: str,
     batch: int,
     threads: int,
@@ -96,6 +102,8 @@ def refine(
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
+    if candidates is not None and method != SEARCH:
+        raise click.UsageError(f"--candidates is for --method {SEARCH}, {method} follows one pose")
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 
@@ -140,6 +148,8 @@ def refine(
         start_sidecar=read_sidecar(init) or {}, refined=result,
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
+    if candidates is not None:
+        write_results(candidates, result.tried)
     of_line = {start.line: start for start in starts}
     for line, why in list(result.failures.items())[:SHOWN_FAILURES]:
         start = of_line[line]
