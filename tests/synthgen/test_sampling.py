@@ -77,7 +77,7 @@ def test_hypotheses_stay_within_their_bounds_and_reach_them(config_of, tug_targe
     angles, lengths = [], []
     for i in range(400):
         rng = stream(0, Purpose.PAIRS, Subject.HYPOTHESIS, i)
-        H = sampling.draw_hypothesis(rng, config.perturbation, T, tug_target)
+        H = sampling.draw_hypothesis(rng, config.perturbation, T, tug_target.mesh)
         angles.append(np.degrees(rotation_angle_rad(H[:3, :3] @ T[:3, :3].T)))
         lengths.append(np.linalg.norm(H[:3, :3] @ tug_target.mesh.center_m + H[:3, 3] - centre))
     assert max(angles) <= 30 + 1e-9

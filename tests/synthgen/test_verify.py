@@ -243,7 +243,7 @@ def test_a_card_without_what_checks_need_is_one_line(copy):
     group = json.loads((copy / "zarr.json").read_text())
     del group["attributes"]["config"]["perturbation"]
     (copy / "zarr.json").write_text(json.dumps(group))
-    with pytest.raises(ShardError, match=r"the data card lacks what .* writes .*perturbation"):
+    with pytest.raises(ShardError, match=r"the data card lacks what .* write .*perturbation"):
         verify(str(copy))
 
 

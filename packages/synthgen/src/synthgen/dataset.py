@@ -19,7 +19,7 @@ from synthgen.draw.target import Target, make_targets
 
 # What decides the bytes of a sample beside the project itself.
 _PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "numcodecs", "moderngl", "trimesh")
-_UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
+UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
 DEPTH_STEPS = 65535  # depth is stored in 16 bits
 FINEST_DEPTH_STEP_M = 1e-4
 
@@ -55,7 +55,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], assets: A
         },
         "camera": config_tools.to_dict(camera),
         **assets.card(),
-        "units": _UNITS,
+        "units": UNITS,
         "versions": versions(config),
     }
 
@@ -105,11 +105,14 @@ def estimated_bytes(config: SynthConfig, n: int) -> int:
 
 def versions(config: SynthConfig) -> dict[str, str]:
     """Versions of what decides the bytes of a render."""
-    names = list(_PACKAGES)
-    if {config.engine, config.hypothesis_engine} & {"cycles", "eevee"}:
-        names.append("bpy")
+    blender = bool({config.engine, config.hypothesis_engine} & {"cycles", "eevee"})
+    return package_versions(("bpy",) if blender else ())
+
+
+def package_versions(further: Sequence[str] = ()) -> dict[str, str]:
+    """Versions of what decides the bytes of a sample."""
     found = {}
-    for name in names:
+    for name in (*_PACKAGES, *further):
         try:
             found[name] = version(name)
         except PackageNotFoundError:  # a checkout on the path

@@ -232,7 +232,7 @@ class PairMaker:
         truth = sampling.target_box(draw.target, self.camera, draw.T_cam_obj)
         while attempts[number] < MAX_HYPOTHESIS_ATTEMPTS:
             rng = stream(self.config.seed, Purpose.PAIRS, Subject.HYPOTHESIS, scene_index, number, attempts[number])
-            T = sampling.draw_hypothesis(rng, self.config.perturbation, draw.T_cam_obj, draw.target)
+            T = sampling.draw_hypothesis(rng, self.config.perturbation, draw.T_cam_obj, draw.target.mesh)
             box = sampling.target_box(draw.target, self.camera, T)
             if np.isfinite(box).all():
                 window = fixed_window(draw.target.hull_m, self.camera.K, T, draw.target.window_side_px)

@@ -3,6 +3,7 @@
 import click
 
 from synthgen.cli.bop import bop
+from synthgen.cli.cut import cut
 from synthgen.cli.doctor import doctor
 from synthgen.cli.export import export
 from synthgen.cli.group import CleanGroup
@@ -25,8 +26,9 @@ def main() -> None:
     synthgen verify shards --report verify.html
     synthgen preview shards --out sheet.png
     synthgen bop --object mesh.ply --frames 50 --out test_bop
+    synthgen cut dataset --split train_real --out shards
     """
 
 
-for _command in (bop, doctor, export, info, preview, render, verify):
+for _command in (bop, cut, doctor, export, info, preview, render, verify):
     main.add_command(_command)

@@ -4,6 +4,7 @@ Ranges are (low, high) pairs drawn uniformly unless said otherwise. Sizes are in
 the field's name ends in `_diameter`, so that one preset serves a 3 cm screw and a 2 m chair.
 """
 
+from synthgen.config.cut import CutConfig
 from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.recipe import SynthConfig, load_config, preset_names
@@ -20,6 +21,7 @@ from synthgen.config.surroundings import (
 __all__ = [
     "BackgroundConfig",
     "CameraConfig",
+    "CutConfig",
     "DistanceConfig",
     "FrameConfig",
     "LightConfig",

@@ -6,6 +6,7 @@ from posecore.errors import ConfigError
 
 Range = tuple[float, float]
 IntRange = tuple[int, int]
+MAX_PATCH_PX = 362  # shards hold distances up to 512 px, which is this patch's diagonal
 
 
 def check_range(name: str, value: tuple[float, float], low: float = -math.inf, high: float = math.inf) -> None:

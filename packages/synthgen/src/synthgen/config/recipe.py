@@ -11,7 +11,7 @@ from posecore.files import data_spec
 
 from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
-from synthgen.config.ranges import check
+from synthgen.config.ranges import MAX_PATCH_PX, check
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -22,8 +22,6 @@ from synthgen.config.surroundings import (
     TabletopConfig,
 )
 from synthgen.engine import Device, EngineName
-
-MAX_PATCH_PX = 362  # shards hold distances up to 512 px, which is this patch's diagonal
 
 
 @dataclass(frozen=True, kw_only=True)

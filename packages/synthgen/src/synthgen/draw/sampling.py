@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 from posecore.camera import Camera
+from posecore.mesh import Mesh
 from posecore.se3 import inverse, make_T, random_direction, random_rotation, rotation_from_rotvec
 from posecore.window import silhouette_box
 
@@ -234,7 +235,7 @@ def _level(
 
 
 def draw_hypothesis(
-    rng: np.random.Generator, config: PerturbationConfig, T_cam_obj: Float[Array, "4 4"], target: Target
+    rng: np.random.Generator, config: PerturbationConfig, T_cam_obj: Float[Array, "4 4"], mesh: Mesh
 ) -> Float[Array, "4 4"]:
     """Perturb a true pose: turn it about the object's box centre and move it.
 
@@ -243,12 +244,12 @@ def draw_hypothesis(
     """
     ease = config.easy_scale if rng.random() < config.easy_share else 1.0
     angle = math.radians(config.max_angle_deg) * ease * rng.uniform()
-    length_m = config.max_translation_diameter * target.mesh.diameter_m * ease * rng.uniform()
+    length_m = config.max_translation_diameter * mesh.diameter_m * ease * rng.uniform()
     dR = rotation_from_rotvec(random_direction(rng) * angle)
     R, t = T_cam_obj[:3, :3], T_cam_obj[:3, 3]
-    centre = R @ target.mesh.center_m + t
+    centre = R @ mesh.center_m + t
     moved = centre + random_direction(rng) * length_m
-    return make_T(dR @ R, moved - dR @ R @ target.mesh.center_m)
+    return make_T(dR @ R, moved - dR @ R @ mesh.center_m)
 
 
 def draw_lights(

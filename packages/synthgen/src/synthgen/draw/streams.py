@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What the scenes are for; training pairs, images of different splits and sequences never share a scene."""
+    """What the scenes are for: training pairs, images of different splits, sequences and given images share none."""
 
     PAIRS = 0
     FRAMES = 1
@@ -19,6 +19,7 @@ class Purpose(IntEnum):
     SEQUENCES = 4
     VALIDATION_SEQUENCES = 5
     TRAINING_SEQUENCES = 6
+    ANNOTATED = 7
 
 
 class Subject(IntEnum):

@@ -103,10 +103,7 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
         ConfigError: The distance range does not suit the object's size.
     """
     distance_m = config.distance.range_m(mesh.diameter_m)
-    try:
-        hull_m = mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices]
-    except QhullError:  # a flat object has no hull with volume
-        hull_m = mesh.vertices_m
+    hull_m = hull(mesh)
     camera = config.camera.camera()
     centred = hull_m - mesh.center_m
     side_px = fixed_side_px(centred, camera.K, distance_m[0], config.window.padding)
@@ -128,6 +125,14 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
         tables=tables,
         reach_m=reach_m,
     )
+
+
+def hull(mesh: Mesh) -> Float[Array, "h 3"]:
+    """Vertices of the convex hull; all of them of a flat object, which has no hull with volume."""
+    try:
+        return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices])
+    except QhullError:
+        return mesh.vertices_m
 
 
 def _shapes(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets) -> dict[int, Mesh]:

@@ -10,7 +10,7 @@ from posecore.errors import DatasetError
 from posecore.shard import ShardReader, n_shards
 
 from synthgen.bop.bopset import CARD as BOP_CARD
-from synthgen.config import load_config
+from synthgen.config import CutConfig, load_config
 from synthgen.verify.facts import manifest_lines
 
 _ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # and what is counted of each
@@ -33,7 +33,18 @@ def dataset_info(url: str) -> dict[str, Any]:
     for line in lines.values():
         for field, size in line["bytes"].items():
             sizes[field] = sizes.get(field, 0) + int(size)
-    known = ("n", "shard_size", "patch_px", "contour_points", "depth_step_m", "seed", "objects", "camera", "units")
+    known = (
+        "n",
+        "shard_size",
+        "patch_px",
+        "contour_points",
+        "depth_step_m",
+        "seed",
+        "source",
+        "objects",
+        "camera",
+        "units",
+    )
     return {
         "kind": "training pairs",
         "dataset": url,
@@ -46,18 +57,20 @@ def dataset_info(url: str) -> dict[str, Any]:
         "bytes_per_pair": {name: size / max(1, pairs) for name, size in sorted(sizes.items(), key=_by_size)},
         "quarantined_scenes": sorted(int(i) for line in lines.values() for i in line.get("quarantined", ())),
         "rejected_draws": sum(int(line["rejected"]) for line in lines.values()),
-        "changed_keys": changed_keys(card.get("config", {})),
+        "changed_keys": changed_keys(card["cut"], CutConfig())
+        if "cut" in card
+        else changed_keys(card.get("config", {})),
         "card": {key: card[key] for key in known if key in card},
         "assets": {name: card.get(name) for name in _ASSETS},
         "versions": card.get("versions", {}),
     }
 
 
-def changed_keys(config: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Keys of a resolved configuration that differ from the default preset: (value there, default)."""
-    default = _flat(json.loads(json.dumps(config_tools.to_dict(load_config("default")))))
+def changed_keys(config: Mapping[str, Any], default: CutConfig | None = None) -> dict[str, tuple[Any, Any]]:
+    """Keys of a resolved configuration that differ from a default, that of `render`: (value there, default)."""
+    usual = _flat(json.loads(json.dumps(config_tools.to_dict(default or load_config("default")))))
     found = _flat(json.loads(json.dumps(dict(config))))
-    return {key: (value, default.get(key)) for key, value in found.items() if value != default.get(key)}
+    return {key: (value, usual.get(key)) for key, value in found.items() if value != usual.get(key)}
 
 
 def info_text(info: Mapping[str, Any]) -> str:
@@ -69,12 +82,14 @@ def info_text(info: Mapping[str, Any]) -> str:
         each = f" of each of {info['sequences']} sequences" if info["sequences"] else ""
         lines += [_entry("split", info["split"]), _entry("frames", f"{info['frames']}{each}")]
     card = info["card"]
+    if "source" in card:
+        lines += _source_lines(card["source"])
     if "camera" in card:
         lines.append(_entry("camera", _camera(card["camera"])))
     for obj_id, entry in card.get("objects", {}).items():
         size = f", diameter {1e3 * entry['diameter_m']:.4g} mm" if "diameter_m" in entry else ""
         lines.append(_entry(f"object {obj_id}", f"{entry['name']}{size}, sha256 {str(entry['sha256'])[:16]}"))
-    lines.append(_entry("settings", "as in the preset default" if not info["changed_keys"] else "differ in"))
+    lines.append(_entry("settings", "the defaults" if not info["changed_keys"] else "differ in"))
     lines += [f"    {key}: {value} (default {usual})" for key, (value, usual) in info["changed_keys"].items()]
     for name, entry in info["assets"].items():
         if entry:
@@ -84,6 +99,14 @@ def info_text(info: Mapping[str, Any]) -> str:
         lines.append(_entry("units", ", ".join(f"{name} {unit}" for name, unit in card["units"].items())))
     lines.append(_entry("versions", ", ".join(f"{name} {number}" for name, number in info["versions"].items())))
     return "\n".join(lines)
+
+
+def _source_lines(source: Mapping[str, Any]) -> list[str]:
+    digest = source["hypotheses_sha256"]
+    hypotheses = "drawn" if digest is None else f"of a result file, sha256 {digest[:16]}"
+    lines = [_entry("images", f"{source['images']} of {source['dataset']}, split {source['split']}")]
+    lines += [_entry("hypotheses", hypotheses)]
+    return lines + [_entry("left out", f"{count} {why}") for why, count in sorted(source["left_out"].items())]
 
 
 def _pair_lines(info: Mapping[str, Any]) -> list[str]:

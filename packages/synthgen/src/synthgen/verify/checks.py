@@ -13,7 +13,7 @@ from posecore import se3
 from posecore.camera import crop_K, project
 from posecore.contour import distance_transform_px
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
-from posecore.window import Window, fixed_window
+from posecore.window import Window, diameter_window, fixed_window
 
 from synthgen.image.region import inside_image
 from synthgen.pair import MAX_ATTEMPTS, MAX_HYPOTHESIS_ATTEMPTS
@@ -38,6 +38,7 @@ class Check:
         unit: Of measure and tolerance.
         why: Reason for the tolerance.
         drawn: Whether only the drawn samples are looked at, because it costs milliseconds.
+        rendered: Whether it holds of rendered pairs alone, whose recipe says where poses may lie.
         measure: How far each sample is off.
     """
 
@@ -47,6 +48,7 @@ class Check:
     unit: str
     why: str
     drawn: bool
+    rendered: bool
     measure: Measure
 
 
@@ -54,11 +56,22 @@ CHECKS: list[Check] = []
 """Every check of a sample, in the order in which they are reported."""
 
 
-def _check(name: str, tolerance: float, unit: str, why: str, *, drawn: bool = False) -> Callable[[Measure], Measure]:
+def _check(
+    name: str, tolerance: float, unit: str, why: str, *, drawn: bool = False, rendered: bool = False
+) -> Callable[[Measure], Measure]:
     def register(measure: Measure) -> Measure:
         what = " ".join((measure.__doc__ or "").split())
         CHECKS.append(
-            Check(name=name, what=what, tolerance=tolerance, unit=unit, why=why, drawn=drawn, measure=measure)
+            Check(
+                name=name,
+                what=what,
+                tolerance=tolerance,
+                unit=unit,
+                why=why,
+                drawn=drawn,
+                rendered=rendered,
+                measure=measure,
+            )
         )
         return measure
 
@@ -93,9 +106,10 @@ def poses(batch: Batch) -> Float[Array, " n"]:
 
 @_check("camera", 1e-6, "px", "float64 throughout; the card's numbers are the ones that were used")
 def camera(batch: Batch) -> Float[Array, " n"]:
-    """K is the card's camera, and K_crop is K cut to window_px."""
+    """K is the card's camera where all images have one, and K_crop is K cut to window_px."""
     K, windows = batch["K"], batch["window_px"]
-    worst = np.abs(K - batch.facts.camera.K).max(axis=(1, 2))
+    shared = batch.facts.card["camera"].get("shared", True)
+    worst = np.abs(K - batch.facts.camera.K).max(axis=(1, 2)) * shared
     for i in range(len(batch)):
         if windows[i, 2] > 0:
             expected = crop_K(K[i], _window(windows[i]), batch.facts.patch_px)
@@ -113,18 +127,26 @@ def known_object(batch: Batch) -> Float[Array, " n"]:
 
 @_check("window", 1e-3, "px", "the box is projected from models/, whose millimetres are float32")
 def window(batch: Batch) -> Float[Array, " n"]:
-    """The window has its object's fixed side and is centred on the hypothesis' box."""
+    """The window has its object's fixed side and is centred on the hypothesis' box, or follows its distance."""
     side_px = batch.facts.of_objects(batch["obj_id"], "window_side_px")
+    scale = batch.facts.diameter_scale
     off = np.full(len(batch), np.inf)
     for i, obj_id in enumerate(batch["obj_id"].tolist()):
         if obj_id in batch.facts.meshes:
             T = batch["T_cam_obj_hypothesis"][i]
-            expected = fixed_window(batch.facts.hulls_m[obj_id], batch["K"][i], T, side_px[i]).as_array()
-            off[i] = np.abs(batch["window_px"][i] - expected).max()
+            mesh, K = batch.facts.meshes[obj_id], batch["K"][i]
+            expected = (
+                fixed_window(batch.facts.hulls_m[obj_id], K, T, side_px[i])
+                if scale is None
+                else diameter_window(K, T, mesh.center_m, mesh.diameter_m, scale)
+            )
+            off[i] = np.abs(batch["window_px"][i] - expected.as_array()).max()
     return off
 
 
-@_check("distance", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32")
+@_check(
+    "distance", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32", rendered=True
+)
 def distance(batch: Batch) -> Float[Array, " n"]:
     """Camera z of the box centre at the truth lies in the configured range."""
     distance = batch.facts.card["config"]["distance"]
@@ -134,21 +156,23 @@ def distance(batch: Batch) -> Float[Array, " n"]:
     return np.maximum(distance["min"] * scale - z, z - distance["max"] * scale).clip(0) / diameter_m
 
 
-@_check("angle", 1e-6, "deg", "float64 throughout; the angle of two rotations is exact to 1e-8 rad")
+@_check("angle", 1e-6, "deg", "float64 throughout; the angle of two rotations is exact to 1e-8 rad", rendered=True)
 def angle(batch: Batch) -> Float[Array, " n"]:
     """The hypothesis is turned against the truth by no more than perturbation.max_angle_deg."""
     limit = batch.facts.card["config"]["perturbation"]["max_angle_deg"]
     return (perturbation_deg(batch) - limit).clip(0)
 
 
-@_check("translation", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32")
+@_check(
+    "translation", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32", rendered=True
+)
 def translation(batch: Batch) -> Float[Array, " n"]:
     """The box centre, about which the hypothesis is turned, moves by at most perturbation.max_translation_diameter."""
     limit = batch.facts.card["config"]["perturbation"]["max_translation_diameter"]
     return (moved_diameters(batch) - limit).clip(0)
 
 
-@_check("scene", 0, "flag", "poses of one scene are copies of one another")
+@_check("scene", 0, "flag", "poses of one scene are copies of one another", rendered=True)
 def scene(batch: Batch) -> Float[Array, " n"]:
     """scene_index is the sample's index over the hypotheses per scene; its samples share object and true pose."""
     per_scene = batch.facts.hypotheses_per_scene
@@ -178,7 +202,7 @@ def scene_patch(batch: Batch) -> Float[Array, " n"]:
 @_check("hypothesis patch", 0, "pixels", "the silhouette is the render's own; 2 px more where an engine anti-aliases")
 def hypothesis_patch(batch: Batch) -> Float[Array, " n"]:
     """The hypothesis patch shows something inside its silhouette and is black outside."""
-    exact = batch.facts.card["config"]["hypothesis_engine"] == "raster"
+    exact = not batch.facts.rendered or batch.facts.card["config"]["hypothesis_engine"] == "raster"
     off = np.zeros(len(batch))
     for i, (rgb, mask) in enumerate(zip(batch["hypothesis_rgb"], batch.hypothesis_mask, strict=True)):
         lit = rgb.any(axis=-1)

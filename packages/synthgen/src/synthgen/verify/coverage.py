@@ -56,8 +56,8 @@ def joined(parts: Sequence[Coverage]) -> dict[str, Array]:
 
 
 def scenes_of(coverage: Coverage) -> dict[str, Array]:
-    """The first sample of each scene: what belongs to the truth counts once a scene."""
-    _, first = np.unique(coverage["scene"], return_index=True)
+    """The first sample of each object in each scene: what belongs to the truth counts once there."""
+    _, first = np.unique(np.stack([coverage["scene"], coverage["obj_id"]]), axis=1, return_index=True)
     return {name: values[first] for name, values in coverage.items()}
 
 

@@ -17,7 +17,8 @@ from posecore.errors import MeshError, RenderError, ShardError
 from posecore.mesh import Mesh, load_mesh
 from posecore.raster import Rasteriser
 from posecore.shard import BIT_OBJECT, MANIFEST, ShardReader, field_table
-from scipy.spatial import ConvexHull, QhullError
+
+from synthgen.draw.target import hull
 
 Array = np.ndarray
 
@@ -26,6 +27,8 @@ _NEEDED = {  # keys of the configuration that checks hold samples against
     "distance": ("unit", "min", "max"),
     "perturbation": ("max_angle_deg", "max_translation_diameter"),
 }
+
+_NEEDED_OF_CUT = {"": ("window", "scale")}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,6 +51,17 @@ class Facts:
     def patch_px(self) -> int:
         """Side of the patches."""
         return int(self.card["patch_px"])
+
+    @property
+    def rendered(self) -> bool:
+        """Whether pairs were rendered after a recipe, not cut out of images."""
+        return "config" in self.card
+
+    @property
+    def diameter_scale(self) -> float | None:
+        """Side of windows that follow the hypothesis' distance over its projected diameter; None of fixed ones."""
+        recipe = {} if self.rendered else self.card["cut"]
+        return float(recipe["scale"]) if recipe.get("window") == "diameter" else None
 
     @property
     def hypotheses_per_scene(self) -> int:
@@ -74,7 +88,7 @@ def load_facts(reader: ShardReader) -> Facts:
     """Read the objects of a dataset.
 
     Raises:
-        ShardError: A model is missing or broken, or the card lacks what a card of `synthgen render` has.
+        ShardError: A model is missing or broken, or the card lacks what those of `synthgen render` and `cut` have.
     """
     card = reader.card
     meshes, hulls = {}, {}
@@ -83,18 +97,19 @@ def load_facts(reader: ShardReader) -> Facts:
         camera = card["camera"]
         K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
         whole = Camera(K=K, width_px=camera["width_px"], height_px=camera["height_px"])
-        for group, keys in _NEEDED.items():
+        needed, recipe = (_NEEDED_OF_CUT, card["cut"]) if "cut" in card else (_NEEDED, card["config"])
+        for group, keys in needed.items():
             for key in keys:
-                (card["config"][group] if group else card["config"])[key]
+                (recipe[group] if group else recipe)[key]
         for obj_id, entry in entries.items():
             meshes[obj_id] = _stored_mesh(reader, str(entry["path"]))
-            hulls[obj_id] = _hull(meshes[obj_id])
+            hulls[obj_id] = hull(meshes[obj_id])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, ShardError):
             raise
         raise ShardError(
-            f"{reader.url}: the data card lacks what `synthgen render` writes ({type(error).__name__}: {error}); "
-            "only datasets made by it can be verified"
+            f"{reader.url}: the data card lacks what `synthgen render` and `synthgen cut` write "
+            f"({type(error).__name__}: {error}); only datasets made by them can be verified"
         ) from error
     return Facts(card=card, meshes=meshes, hulls_m=hulls, camera=whole)
 
@@ -114,13 +129,6 @@ def _stored_mesh(reader: ShardReader, key: str) -> Mesh:
         except MeshError as error:
             reason = re.sub(re.escape(str(file)), "", str(error)).lstrip(": ")
             raise ShardError(f"{reader.url}/{key}: {reason}") from error
-
-
-def _hull(mesh: Mesh) -> Array:
-    try:
-        return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices])
-    except QhullError:  # a flat object
-        return mesh.vertices_m
 
 
 class Batch:

@@ -119,13 +119,14 @@ def _checks_notes(report: Report) -> str:
 
 
 def _coverage(report: Report) -> str:
-    coverage, config = report.coverage, report.card["config"]
+    coverage = report.coverage
     if not coverage:
         return ""
     scenes = scenes_of(coverage)
     rings = int(np.clip(np.sqrt(len(scenes["scene"]) / (6 * _PER_CELL)), 1, 12))
-    distance, perturbation = config["distance"], config["perturbation"]
-    by_diameter = distance["unit"] == "diameter"
+    ranges = _ranges(report)
+    by_diameter = "distance_diameters" in ranges
+    distance = "distance_diameters" if by_diameter else "distance_m"
     counts = {str(i): int((coverage["obj_id"] == i).sum()) for i in sorted(report.facts.meshes)}
     figures = [
         plots.sphere_maps(*view_counts(scenes["view"], rings), rings),
@@ -134,25 +135,32 @@ def _coverage(report: Report) -> str:
         plots.histogram(
             "Distance, by scene",
             "diameters" if by_diameter else "metres",
-            scenes["distance_diameters" if by_diameter else "distance_m"],
-            distance["min"],
-            distance["max"],
+            scenes[distance],
+            *ranges[distance],
         ),
+        plots.histogram("Perturbation, angle", "degrees", coverage["angle_deg"], *ranges["angle_deg"]),
         plots.histogram(
-            "Perturbation, angle", "degrees", coverage["angle_deg"], 0, perturbation["max_angle_deg"] * 1.0001
-        ),
-        plots.histogram(
-            "Perturbation, translation",
-            "diameters",
-            coverage["moved_diameters"],
-            0,
-            perturbation["max_translation_diameter"] * 1.0001,
+            "Perturbation, translation", "diameters", coverage["moved_diameters"], *ranges["moved_diameters"]
         ),
         plots.histogram("Visible fraction", "share of the silhouette", coverage["visible_fraction"], 0, 1),
         plots.bars("Samples by object", "object id", counts),
         _rejected(coverage["rejected"]),
     ]
     return f'<div class="plots">{"".join(figures)}</div>'
+
+
+def _ranges(report: Report) -> dict[str, tuple[float, float]]:
+    """Ends of the histograms by what they show: the recipe's, or the data's where pairs were cut out of images."""
+    if not report.facts.rendered:
+        names = ("distance_m", "angle_deg", "moved_diameters")
+        return {name: (0.0, max(1e-3, 1.0001 * float(report.coverage[name].max()))) for name in names}
+    distance, perturbation = (report.card["config"][key] for key in ("distance", "perturbation"))
+    name = "distance_diameters" if distance["unit"] == "diameter" else "distance_m"
+    return {
+        name: (distance["min"], distance["max"]),
+        "angle_deg": (0.0, perturbation["max_angle_deg"] * 1.0001),
+        "moved_diameters": (0.0, perturbation["max_translation_diameter"] * 1.0001),
+    }
 
 
 def _rejected(draws: Array) -> str:
@@ -197,7 +205,7 @@ def _card(report: Report) -> str:
         "digest": report.digest,
         "schema": f"{card['schema']} {card['schema_version']}",
         "seed": str(card["seed"]),
-        "engine": f"{card['config']['engine']}, hypotheses {card['config']['hypothesis_engine']}",
+        **_origin(report),
         "camera": f"{camera['width_px']} x {camera['height_px']} px, fx {camera['fx']:g}, fy {camera['fy']:g}",
         "patch": f"{card['patch_px']} px, {card['contour_points']} contour points",
         "objects": "; ".join(_object_text(i, entry) for i, entry in card["objects"].items()),
@@ -205,6 +213,15 @@ def _card(report: Report) -> str:
     }
     items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries.items())
     return f"<dl>{items}</dl>"
+
+
+def _origin(report: Report) -> dict[str, str]:
+    """What made the scenes."""
+    card = report.card
+    if report.facts.rendered:
+        return {"engine": f"{card['config']['engine']}, hypotheses {card['config']['hypothesis_engine']}"}
+    source = card["source"]
+    return {"images": f"{source['images']} of {source['dataset']}, split {source['split']}"}
 
 
 def _object_text(obj_id: str, entry: Mapping[str, Any]) -> str:

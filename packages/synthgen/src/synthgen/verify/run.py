@@ -18,7 +18,7 @@ from posecore.shard.group import metadata
 
 from synthgen.pair import limit_threads
 from synthgen.run.processes import die_with_parent
-from synthgen.verify.checks import CHECKS
+from synthgen.verify.checks import CHECKS, Check
 from synthgen.verify.coverage import Coverage, coverage_of, joined
 from synthgen.verify.facts import Batch, Facts, load_facts, manifest_lines
 from synthgen.verify.findings import FIRST, Finding, Report, dataset_finding, tolerance_text
@@ -64,13 +64,14 @@ class ShardVerifier:
             return ShardResult(shard_id=shard_id, n=count, damage=str(error))
         indices = shard_id * self.reader.shard_size + np.arange(count)
         batch = Batch(values, indices, self.facts)
-        measured = {c.name: (c.measure(batch), indices) for c in CHECKS if not c.drawn}
+        checks = checks_of(self.facts)
+        measured = {c.name: (c.measure(batch), indices) for c in checks if not c.drawn}
         if len(drawn):
             if self._rasteriser is None:
                 self._rasteriser = Rasteriser(self.facts.meshes)
             places = np.asarray(drawn)
             part = Batch({k: v[places] for k, v in values.items()}, indices[places], self.facts, self._rasteriser)
-            measured |= {c.name: (c.measure(part), part.indices) for c in CHECKS if c.drawn}
+            measured |= {c.name: (c.measure(part), part.indices) for c in checks if c.drawn}
         line = self._lines[shard_id]
         return ShardResult(
             shard_id=shard_id,
@@ -112,7 +113,7 @@ def verify(
         on_shard: Called with each shard's number of samples.
 
     Raises:
-        ShardError: Not a dataset of `synthgen render`, or nothing is rendered yet.
+        ShardError: Not a dataset of `synthgen render` or `cut`, or nothing is rendered yet.
         RenderError: No EGL device, or a worker process died.
     """
     limit_threads(1)
@@ -128,7 +129,7 @@ def verify(
             results.append(result)
             on_shard(result.n)
     findings = [_complete(reader, allow_incomplete), _arrays(reader), _objects(facts)]
-    findings += [*_shards(results), *_samples(results), _duplicates(results, reader.shard_size)]
+    findings += [*_shards(results), *_samples(results, facts), _duplicates(results, reader.shard_size)]
     return Report(
         url=url,
         card=dict(reader.card),
@@ -231,9 +232,14 @@ def _shards(results: Sequence[ShardResult]) -> list[Finding]:
     ]
 
 
-def _samples(results: Sequence[ShardResult]) -> list[Finding]:
+def checks_of(facts: Facts) -> list[Check]:
+    """The checks that say something of this dataset."""
+    return [check for check in CHECKS if facts.rendered or not check.rendered]
+
+
+def _samples(results: Sequence[ShardResult], facts: Facts) -> list[Finding]:
     findings = []
-    for check in CHECKS:
+    for check in checks_of(facts):
         parts = [r.measured[check.name] for r in results if check.name in r.measured]
         measure = np.concatenate([m for m, _ in parts]) if parts else np.zeros(0)
         indices = np.concatenate([i for _, i in parts]) if parts else np.zeros(0, np.int64)

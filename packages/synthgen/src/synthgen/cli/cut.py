@@ -1,0 +1,83 @@
+"""`synthgen cut`."""
+
+from pathlib import Path
+
+import click
+
+from synthgen.cli.console import progress_bar, stoppable
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--out", required=True, type=str, metavar="DIR", help="Where to. The same command again continues it.")
+@click.option(
+    "--split",
+    metavar="NAME",
+    help="Split folder of the dataset. [test, val, train_pbr, train or the only one, in this order]",
+)
+@click.option("--sensor", metavar="NAME", help="Which camera of several, as in scene_camera_NAME.json.")
+@click.option(
+    "--hypotheses",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="BOP result file: each line is a hypothesis of the nearest annotated instance of its object; images without "
+    "a line give no pair. [drawn around the annotated poses]",
+)
+@click.option("--patch-px", type=int, help="Side of the patches. [224]")
+@click.option("--hypotheses-per-pose", type=int, help="Hypotheses drawn around each annotated pose. [8]")
+@click.option("--seed", type=click.IntRange(0), help="Of hypotheses and of the order of images. [0]")
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one configuration key: seed, patch_px, contour_points, hypotheses_per_pose, shard_size, min_visible, "
+    "min_side_px, window, scale, padding, perturbation.max_angle_deg, ... Repeatable; last wins.",
+)
+@click.option("--quiet", is_flag=True, help="No progress bar.")
+def cut(
+    dataset: Path,
+    out: str,
+    split: str | None,
+    sensor: str | None,
+    hypotheses: Path | None,
+    overrides: tuple[str, ...],
+    quiet: bool,
+    **values: int | None,
+) -> None:
+    """Cut training pairs out of the annotated images of DATASET, a folder in BOP layout.
+
+    For training on real images, or on the errors of a detector or of a refinement, whose result file --hypotheses
+    takes. Poses that are hidden and hypotheses that their windows do not hold are left out, and counted. Never train
+    on images that you report results on.
+
+    \b
+    synthgen cut ycbv --split train_real --out shards
+    synthgen cut my_images --out shards --hypotheses detections.csv
+    synthgen cut my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
+    """
+    from posecore import config as config_tools
+    from posecore.bop import BopDataset
+    from posecore.shard import ShardWriter
+
+    from synthgen import annotated
+    from synthgen.config import CutConfig
+    from synthgen.dataset import model_files
+    from synthgen.run import lock
+
+    given = {key: value for key, value in values.items() if value is not None}
+    mapping = config_tools.apply_overrides({}, overrides) | given
+    config = config_tools.build(CutConfig, mapping, "--set")
+    images = BopDataset(dataset, split, sensor)
+    planned = annotated.plan(images, config, hypotheses)
+    for reason, count in sorted(planned.left_out.items()):
+        click.echo(f"{images.split_path}: left out: {count} {reason}", err=True)
+    with lock.held(out), stoppable(out):
+        writer = ShardWriter.create(out, annotated.make_card(images, planned, config, hypotheses))
+        infos = images.models_info
+        for key, data in model_files(planned.meshes, {i: infos[i] for i in planned.meshes if i in infos}).items():
+            writer.add_file(key, data)
+        with progress_bar(quiet) as bar:
+            task = bar.add_task("pairs", total=planned.n)
+            annotated.cut_pairs(images, planned, config, writer, lambda count: bar.advance(task, count))
+    click.echo(f"{out}: complete, {planned.n} pairs of {len(planned.images)} images", err=True)
