@@ -17,12 +17,14 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from posecore.shard import load_meshes
 from refinenet import checkpoint, metrics
 from refinenet.config import TrainConfig, load_config
 from refinenet.data import PairSource, validation_batches
 from refinenet.device import choose_device
 from refinenet.loss import ObjectPoints
-from refinenet.objects import load_meshes, load_models, object_points
+from refinenet.objects import load_models, object_points
+from refinenet.split import Split, spread_rows
 from refinenet.train import train
 
 PATCH_PX = 64

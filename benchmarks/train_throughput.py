@@ -50,7 +50,7 @@ def main() -> None:
         step_flops = flops(run, kept)
 
         def streamed() -> None:
-            run.take_step(next(batches))
+            run.take_step(next(batches))  # noqa: F821 (it is deleted after the last call)
 
         def held() -> None:
             run.take_step(kept)

@@ -11,14 +11,13 @@ from posecore import raster, se3
 from posecore.bop import BopDataset, BopWriter, Estimate, read_results, read_sidecar, write_models, write_results
 from posecore.camera import Camera, project
 from posecore.errors import CameraError, CheckpointError
-from posecore.mesh import Mesh, load_mesh, save_ply
+from posecore.mesh import Mesh, load_mesh, mesh_digest, save_ply
 from posecore.raster import Rasteriser
 from posecore.window import Window, cut, diameter_window
 from refinenet import checkpoint, geometry
 from refinenet.config import load_config
 from refinenet.errors import RefinementError
 from refinenet.geometry import PoseUpdate
-from refinenet.inputs import mesh_digest
 from refinenet.methods import Frame, Request, Status
 from refinenet.network import make_network
 from refinenet.pool import PooledRefiner

@@ -116,6 +116,18 @@ def diameter(points_m: Float[Array, "v 3"]) -> float:
     return max(float(cdist(points[i : i + 512], points[i:]).max()) for i in blocks)
 
 
+def mesh_digest(mesh: Mesh) -> str:
+    """Hash of what a mesh looks like: vertices (float32 millimetres), faces, colours, texture.
+
+    Unlike the file's hash it stays the same when the mesh is written anew, as BOP datasets do.
+    """
+    digest = hashlib.sha256((1e3 * mesh.vertices_m).astype("<f4").tobytes())
+    digest.update(mesh.faces.astype("<i4").tobytes())
+    for colours in (mesh.vertex_rgb, mesh.texture_rgb):
+        digest.update(b"-" if colours is None else np.ascontiguousarray(colours).tobytes())
+    return digest.hexdigest()
+
+
 def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: bool = False) -> Mesh:
     """Read a PLY, OBJ, glTF, GLB, STL or OFF file.
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from posecore.errors import ConfigError, PoseError, ShardError
 from posecore.raster import Rasteriser
-from posecore.shard import ShardReader
+from posecore.shard import ShardReader, load_meshes
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
@@ -24,7 +24,7 @@ from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
-from refinenet.objects import for_patches, load_meshes, load_models, symmetries_of
+from refinenet.objects import for_patches, load_models, symmetries_of
 from refinenet.recut import fixed_sides_px
 from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
@@ -67,10 +67,10 @@ class PairSource:
     def __init__(self, url: str, config: TrainConfig, *, training: bool) -> None:
         self.reader = ShardReader(url)
         self._config = config
-        if config.window.kind == "fixed" and self.reader.card.get("cut", {}).get("window") == "diameter":
+        if config.window.kind == "fixed" and self.reader.card.get("windows", "fixed") != "fixed":
             raise ConfigError(
-                f"{url}: windows follow the distance, and preset {config.preset} looks through windows of one side; "
-                "cut pairs with --set window=fixed"
+                f"{url}: windows are not of one side for all poses of an object, which preset {config.preset} looks "
+                "through; cut pairs with --set window=fixed, and merge only datasets with the same ones"
             )
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()

@@ -1,11 +1,8 @@
 """What is checked before a pose is refined: the object, the camera, the units."""
 
-import hashlib
-
-import numpy as np
 from posecore.camera import Camera
 from posecore.errors import CameraError, CheckpointError
-from posecore.mesh import Mesh
+from posecore.mesh import Mesh, mesh_digest
 
 from refinenet.checkpoint import Checkpoint
 from refinenet.methods import Frame
@@ -17,18 +14,6 @@ MEMBER_SIZES = (0.8, 1.25)
 CENTRE_TOLERANCE = 0.2
 """A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
 that of an image of another size."""
-
-
-def mesh_digest(mesh: Mesh) -> str:
-    """Hash of what a mesh looks like: vertices (float32 millimetres), faces, colours, texture.
-
-    Unlike the file's hash it stays the same when the mesh is written anew, as BOP datasets do.
-    """
-    digest = hashlib.sha256((1e3 * mesh.vertices_m).astype("<f4").tobytes())
-    digest.update(mesh.faces.astype("<i4").tobytes())
-    for colours in (mesh.vertex_rgb, mesh.texture_rgb):
-        digest.update(b"-" if colours is None else np.ascontiguousarray(colours).tobytes())
-    return digest.hexdigest()
 
 
 def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:

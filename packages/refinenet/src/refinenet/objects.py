@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
-from posecore.mesh import Mesh, load_mesh
+from posecore.mesh import Mesh
 from posecore.shard import ShardReader
 from posecore.simplify import simplified
 
@@ -17,24 +17,6 @@ from refinenet.loss import ObjectPoints
 def object_ids(reader: ShardReader) -> list[int]:
     """Objects of the data card, sorted."""
     return sorted(int(key) for key in reader.card["objects"])
-
-
-def load_meshes(reader: ShardReader) -> dict[int, Mesh]:
-    """The meshes that the dataset carries in `models/`, by object id.
-
-    Raises:
-        ShardError: One is missing.
-        MeshError: One cannot be read.
-    """
-    meshes = {}
-    with tempfile.TemporaryDirectory() as folder:  # a dataset behind a URL has no paths to load from
-        for obj_id in object_ids(reader):
-            entry = reader.card["objects"][str(obj_id)]
-            for key in filter(None, (entry.get("texture"), entry["path"])):
-                copy = Path(folder) / Path(key).name
-                copy.write_bytes(reader.file(key))
-            meshes[obj_id] = load_mesh(copy, units="mm")
-    return meshes
 
 
 def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:

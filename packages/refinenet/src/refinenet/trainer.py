@@ -14,7 +14,8 @@ from typing import Any
 
 import torch
 from posecore.errors import CheckpointError, ConfigError, ShardError
-from posecore.shard import ShardReader, n_shards
+from posecore.mesh import mesh_digest
+from posecore.shard import ShardReader, load_meshes, n_shards
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -23,10 +24,9 @@ from refinenet.config import TrainConfig
 from refinenet.data import Batch, PairSource, PairStream, make_loader, on_device, validation_batches
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
-from refinenet.inputs import mesh_digest
 from refinenet.loss import make_loss
 from refinenet.network import Pair, PaperNet, make_network
-from refinenet.objects import load_meshes, load_models, object_ids, object_points
+from refinenet.objects import load_models, object_ids, object_points
 from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 from refinenet.own_predictions import OwnPredictions
 from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows

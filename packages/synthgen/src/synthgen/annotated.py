@@ -311,6 +311,7 @@ def make_card(
             "left_out": dict(planned.left_out),
         },
         "cut": config_tools.to_dict(config),
+        "windows": config.window,
         "objects": {
             str(obj_id): {
                 "name": Path(mesh.path).name,

@@ -60,7 +60,7 @@ def to_hdf5(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard =
     """
     if out.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"{out}: expected a name that ends in .h5 or .hdf5; for tars add --format webdataset")
-    reader = _complete(url)
+    reader = complete_dataset(url)
     with _whole(out, overwrite) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["schema"], file.attrs["schema_version"] = reader.card["schema"], reader.card["schema_version"]
         file.attrs["data_card"] = json.dumps(reader.card)
@@ -99,7 +99,7 @@ def to_webdataset(url: str, out: Path, *, overwrite: bool = False, on_shard: OnS
     """
     if out.suffix.lower() in SUFFIXES:
         raise ConfigError(f"{out}: WebDataset is a folder of tars; expected a folder's name, or --format hdf5")
-    reader = _complete(url)
+    reader = complete_dataset(url)
     with _whole(out, overwrite) as temporary:
         temporary.mkdir(parents=True)
         (temporary / "card.json").write_text(json.dumps(reader.card, indent=1), encoding="utf-8")
@@ -161,7 +161,8 @@ def _npz(arrays: Mapping[str, Array]) -> bytes:
     return buffer.getvalue()
 
 
-def _complete(url: str) -> ShardReader:
+def complete_dataset(url: str) -> ShardReader:
+    """A dataset of which every shard is there; else a ShardError."""
     reader = ShardReader(url)
     if not reader.complete:
         raise ShardError(
@@ -178,14 +179,23 @@ def _require_room(out: Path, size_bytes: int) -> None:
 
 
 def _models(reader: ShardReader) -> dict[str, bytes]:
-    """The objects' files by key. A card from elsewhere must not name places outside of the export."""
+    """The objects' files by key."""
+    return {key: reader.file(key) for key in model_keys(reader)}
+
+
+def model_keys(reader: ShardReader) -> list[str]:
+    """Where the objects' files lie. A card from elsewhere must not name places outside of the dataset.
+
+    Raises:
+        ShardError: It does.
+    """
     objects = reader.card.get("objects", {}).values()
     keys = [entry[part] for entry in objects for part in ("path", "texture") if entry.get(part)]
     keys += ["models/models_info.json"] if keys else []
     for key in keys:
         if not re.fullmatch(r"models/[\w-][\w.-]*", key):
             raise ShardError(f"{reader.url}: the data card names {key!r} as an object's file, expected models/NAME")
-    return {key: reader.file(key) for key in keys}
+    return keys
 
 
 def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, Array]]]:

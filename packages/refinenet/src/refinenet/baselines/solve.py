@@ -40,7 +40,7 @@ def projection_jacobian(
 
 
 def step(
-    J: Float[Array, "n 6"], residual: Float[Array, "n"], weight: Float[Array, "n"], damping: float
+    J: Float[Array, "n 6"], residual: Float[Array, " n"], weight: Float[Array, " n"], damping: float
 ) -> Float[Array, "6"]:
     """The x that makes sum w (r + J x)^2 smallest, held back where the rows say nothing.
 
@@ -60,6 +60,6 @@ def moved(T_cam_obj: Float[Array, "4 4"], x: Float[Array, "6"], length_m: float)
     return se3.apply_update(T_cam_obj, se3.rotation_from_rotvec(x[:3]), x[3:] * length_m)
 
 
-def tukey_weight(residual: Float[Array, "n"], sigma: float) -> Float[Array, "n"]:
+def tukey_weight(residual: Float[Array, " n"], sigma: float) -> Float[Array, " n"]:
     """Tukey's biweight: 1 for no residual, 0 from 4.7 standard deviations on."""
     return np.square(1 - np.square(residual / (TUKEY * sigma)).clip(0, 1))

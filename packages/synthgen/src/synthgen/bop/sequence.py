@@ -36,9 +36,9 @@ _LIGHT_TURN_RAD = 0.5
 class Wave:
     """A smooth function of time with values in [-amplitude, amplitude]."""
 
-    amplitudes: Float[Array, "k"]
-    rates_rad_s: Float[Array, "k"]
-    phases_rad: Float[Array, "k"]
+    amplitudes: Float[Array, " k"]
+    rates_rad_s: Float[Array, " k"]
+    phases_rad: Float[Array, " k"]
 
     def __call__(self, t_s: float) -> float:
         """Value at a time."""

@@ -8,6 +8,7 @@ from synthgen.cli.doctor import doctor
 from synthgen.cli.export import export
 from synthgen.cli.group import CleanGroup
 from synthgen.cli.info import info
+from synthgen.cli.merge import merge
 from synthgen.cli.preview import preview
 from synthgen.cli.render import render
 from synthgen.cli.verify import verify
@@ -30,5 +31,5 @@ def main() -> None:
     """
 
 
-for _command in (bop, cut, doctor, export, info, preview, render, verify):
+for _command in (bop, cut, doctor, export, info, merge, preview, render, verify):
     main.add_command(_command)

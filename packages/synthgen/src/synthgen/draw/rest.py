@@ -28,7 +28,7 @@ class Rest:
 
     hull_m: Float[Array, "h 3"]
     down: Float[Array, "k 3"]
-    weights: Float[Array, "k"]
+    weights: Float[Array, " k"]
 
 
 def find_rest(mesh: Mesh) -> Rest:
@@ -81,7 +81,7 @@ class Rests(dict[int, Rest]):
         return self[key]
 
 
-def _hit(normals: Float[Array, "f 3"], height: Float[Array, "f"], rays: Float[Array, "r 3"]) -> Array:
+def _hit(normals: Float[Array, "f 3"], height: Float[Array, " f"], rays: Float[Array, "r 3"]) -> Array:
     """Facet that each ray from the centre of mass leaves the hull through."""
     slope = rays @ normals.T
     with np.errstate(divide="ignore"):

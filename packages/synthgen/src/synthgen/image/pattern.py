@@ -9,7 +9,7 @@ from synthgen.scene import Material, Pattern
 Array = np.ndarray
 
 
-def share(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, "n"]:
+def share(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """Share of the accent colour at points in object coordinates, in [0, 1].
 
     Args:

@@ -34,17 +34,9 @@ def dataset_info(url: str) -> dict[str, Any]:
         for field, size in line["bytes"].items():
             sizes[field] = sizes.get(field, 0) + int(size)
     known = (
-        "n",
-        "shard_size",
-        "patch_px",
-        "contour_points",
-        "depth_step_m",
-        "seed",
-        "source",
-        "objects",
-        "camera",
-        "units",
-    )
+        "n", "shard_size", "patch_px", "contour_points", "depth_step_m", "seed", "merged", "source", "objects",
+        "camera", "units",
+    )  # fmt: skip
     return {
         "kind": "training pairs",
         "dataset": url,
@@ -82,6 +74,8 @@ def info_text(info: Mapping[str, Any]) -> str:
         each = f" of each of {info['sequences']} sequences" if info["sequences"] else ""
         lines += [_entry("split", info["split"]), _entry("frames", f"{info['frames']}{each}")]
     card = info["card"]
+    for part in card.get("merged", ()):
+        lines.append(_entry("part", f"{part['card']['n']} pairs, digest {part['digest'][:16]}"))
     if "source" in card:
         lines += _source_lines(card["source"])
     if "camera" in card:
@@ -89,7 +83,8 @@ def info_text(info: Mapping[str, Any]) -> str:
     for obj_id, entry in card.get("objects", {}).items():
         size = f", diameter {1e3 * entry['diameter_m']:.4g} mm" if "diameter_m" in entry else ""
         lines.append(_entry(f"object {obj_id}", f"{entry['name']}{size}, sha256 {str(entry['sha256'])[:16]}"))
-    lines.append(_entry("settings", "the defaults" if not info["changed_keys"] else "differ in"))
+    if "merged" not in card:
+        lines.append(_entry("settings", "the defaults" if not info["changed_keys"] else "differ in"))
     lines += [f"    {key}: {value} (default {usual})" for key, (value, usual) in info["changed_keys"].items()]
     for name, entry in info["assets"].items():
         if entry:

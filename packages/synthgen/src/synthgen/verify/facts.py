@@ -1,22 +1,19 @@
 """What the checks hold samples against: the data card and the objects that lie beside the shards."""
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from posecore.camera import Camera, intrinsics
 from posecore.contour import contour_mask
-from posecore.errors import MeshError, RenderError, ShardError
-from posecore.mesh import Mesh, load_mesh
+from posecore.errors import RenderError, ShardError
+from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.shard import BIT_OBJECT, MANIFEST, ShardReader, field_table
+from posecore.shard import BIT_OBJECT, MANIFEST, ShardReader, field_table, load_meshes
 
 from synthgen.draw.target import hull
 
@@ -88,12 +85,13 @@ def load_facts(reader: ShardReader) -> Facts:
     """Read the objects of a dataset.
 
     Raises:
-        ShardError: A model is missing or broken, or the card lacks what those of `synthgen render` and `cut` have.
+        ShardError: A model is missing or broken, the dataset is merged, or the card lacks what those of
+            `synthgen render` and `cut` have.
     """
     card = reader.card
-    meshes, hulls = {}, {}
+    if "merged" in card:
+        raise ShardError(f"{reader.url}: is merged of {len(card['merged'])} datasets; verify each of those instead")
     try:
-        entries = {int(obj_id): entry for obj_id, entry in card["objects"].items()}
         camera = card["camera"]
         K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
         whole = Camera(K=K, width_px=camera["width_px"], height_px=camera["height_px"])
@@ -101,9 +99,7 @@ def load_facts(reader: ShardReader) -> Facts:
         for group, keys in needed.items():
             for key in keys:
                 (recipe[group] if group else recipe)[key]
-        for obj_id, entry in entries.items():
-            meshes[obj_id] = _stored_mesh(reader, str(entry["path"]))
-            hulls[obj_id] = hull(meshes[obj_id])
+        meshes = load_meshes(reader)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, ShardError):
             raise
@@ -111,24 +107,15 @@ def load_facts(reader: ShardReader) -> Facts:
             f"{reader.url}: the data card lacks what `synthgen render` and `synthgen cut` write "
             f"({type(error).__name__}: {error}); only datasets made by them can be verified"
         ) from error
-    return Facts(card=card, meshes=meshes, hulls_m=hulls, camera=whole)
+    return Facts(
+        card=card, meshes=meshes, hulls_m={obj_id: hull(mesh) for obj_id, mesh in meshes.items()}, camera=whole
+    )
 
 
 def manifest_lines(reader: ShardReader) -> dict[int, dict[str, Any]]:
     """The manifest's lines by shard, as the reader has checked them."""
     lines = [json.loads(text) for text in reader.file(MANIFEST).decode().splitlines()] if reader.committed else []
     return {int(line["shard"]): line for line in lines}
-
-
-def _stored_mesh(reader: ShardReader, key: str) -> Mesh:
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / Path(key).name
-        file.write_bytes(reader.file(key))
-        try:
-            return load_mesh(file)
-        except MeshError as error:
-            reason = re.sub(re.escape(str(file)), "", str(error)).lstrip(": ")
-            raise ShardError(f"{reader.url}/{key}: {reason}") from error
 
 
 class Batch:
