@@ -50,8 +50,7 @@ def test_a_network_learns_to_judge_from_a_searchs_candidates(work: Path) -> None
     )  # fmt: skip
     lines = [json.loads(line) for line in (work / "run" / "metrics.jsonl").read_text().splitlines()]
     told = [line["validation/confidence_error"] for line in lines if "validation/confidence_error" in line]
-    assert len(told) >= 2
-    assert told[-1] != told[0]
+    assert 0 < told[-1] < 0.6
     assert (work / "run" / "best.safetensors").is_file()
 
 
