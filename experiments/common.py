@@ -38,11 +38,13 @@ class Inputs:
         data: LM-O in BOP layout: `models/`, `test/`, `test_targets_bop19.json`, and start poses.
         backbone_weights: ImageNet weights of InceptionV3's stem; without them preset `paper` has its own stem's.
         backgrounds: Folder of photographs to put behind objects.
+        hdris: Folder of panoramas to light scenes with.
     """
 
     data: Path | None = None
     backbone_weights: Path | None = None
     backgrounds: Path | None = None
+    hdris: Path | None = None
 
     def models(self) -> Path:
         """Folder of LM-O's meshes.
@@ -319,12 +321,13 @@ def run(experiment: Experiment) -> int:
     parser.add_argument("--data", type=Path, help="LM-O in BOP layout: models/, test/, test_targets_bop19.json")
     parser.add_argument("--backbone-weights", type=Path, help="ImageNet weights of InceptionV3's stem (safetensors)")
     parser.add_argument("--backgrounds", type=Path, help="photographs to put behind objects")
+    parser.add_argument("--hdris", type=Path, help="panoramas to light scenes with, where an experiment does")
     parser.add_argument("--list", action="store_true", help="show the commands and run none")
     chosen = parser.parse_args()
     work = (chosen.work or Path(f"experiment-{experiment.name}-{chosen.size}")).resolve()
     if work.exists() and not work.is_dir():
         raise SystemExit(f"Error: {work}: is a file, expected a folder to work in; name another")
-    given = {name: getattr(chosen, name) for name in ("data", "backbone_weights", "backgrounds")}
+    given = {name: getattr(chosen, name) for name in ("data", "backbone_weights", "backgrounds", "hdris")}
     for name, path in given.items():
         if path is not None and not path.exists():
             raise SystemExit(f"Error: --{name.replace('_', '-')} {path}: there is no such file or folder")

@@ -52,9 +52,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     models, data = inputs.models(), inputs.data
     assert data is not None
-    init = sorted(data.glob("init*.csv"))
-    if len(init) != 1:
-        raise SystemExit(f"Error: {data}: found {len(init)} files init*.csv, expected one result file of start poses")
+    init = start_poses_of(data)
     full = size == "full"
     networks = full_networks(inputs)
     if not full:
@@ -72,11 +70,23 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             networks=networks,
             baselines=tuple(name for name in BASELINES if name not in NEED_DEPTH or has_depth(data)),
             dataset=data,
-            init=init[0],
+            init=init,
             workers=8 if full else 2,
             render=ON_GPUS if full else "--workers 2",
         ),
     )
+
+
+def start_poses_of(data: Path) -> Path:
+    """The result file of start poses that lies beside the images.
+
+    Raises:
+        SystemExit: There is none, or several.
+    """
+    found = sorted(data.glob("init*.csv"))
+    if len(found) != 1:
+        raise SystemExit(f"Error: {data}: found {len(found)} files init*.csv, expected one result file of start poses")
+    return found[0]
 
 
 def has_depth(data: Path) -> bool:

@@ -9,20 +9,24 @@ import sys
 from pathlib import Path
 
 import click
+import cv2
 import numpy as np
 import pytest
+from posecore import config as config_tools
 from posecore import se3
 from posecore.bop import Estimate, load_models_info, read_results, read_sidecar, write_results
 from posecore.mesh import load_mesh
+from synthgen.config import CutConfig
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from experiments import common, cups, join
+from experiments import common, cups, join, stand_ins
 from experiments.chain import ROOT
 
 NAMES = [
     "perturbation_curves",
     "detection_refinement",
     "lmo_add",
+    "lmo_flow",
     "loss_ablation",
     "category_level",
     "tracking",
@@ -36,7 +40,7 @@ GROUPS = {
     "refinenet": "refinenet.cli:main",
     "evalkit": "evalkit.cli:main",
 }
-SCRIPTS = {"cups.py": cups.parser, "join.py": join.parser}
+SCRIPTS = {"cups.py": cups.parser, "join.py": join.parser, "stand_ins.py": stand_ins.parser}
 
 
 def experiment(name: str) -> common.Experiment:
@@ -86,6 +90,8 @@ def check_settings(program: str, values: dict) -> None:
     if "preset" in values and "overrides" in values:
         loader = importlib.import_module(f"{program}.config").load_config
         loader(values["preset"], values["overrides"])
+    elif "overrides" in values:
+        config_tools.build(CutConfig, config_tools.apply_overrides({}, values["overrides"]), "--set")
 
 
 def check_line(words: list[str]) -> None:
@@ -112,7 +118,7 @@ def test_what_a_step_reads_was_made_before(name, size, inputs, tmp_path) -> None
     work, made = tmp_path / "a b", set()
     for step in experiment(name).plan(work, size, inputs):
         words = list(step.command)
-        outs = {words[place + 1] for place, word in enumerate(words) if word == "--out"}
+        outs = {words[place + 1] for place, word in enumerate(words) if word in ("--out", "--candidates")}
         read = {word for word in words if word.startswith(str(work))} - outs
         if words[0] != "python" or "cups.py" not in words[1]:
             assert all(any(Path(word).is_relative_to(place) for place in made) for word in read), step.command
@@ -124,7 +130,7 @@ def test_training_and_test_scenes_differ(name, inputs, tmp_path) -> None:
     for size in SIZES:
         seeds = {"render": set(), "bop": set()}
         for step in experiment(name).plan(tmp_path, size, inputs):
-            if step.command[0] == "synthgen":
+            if step.command[0] == "synthgen" and step.command[1] in seeds:
                 seeds[step.command[1]].add(step.command[step.command.index("--seed") + 1])
         assert not seeds["render"] & seeds["bop"]
 
@@ -137,6 +143,8 @@ def test_a_wrong_line_is_found(tmp_path) -> None:
             check_line(wrong)
     with pytest.raises(Exception, match="no_such"):
         check_line([*mesh, "3", "--set", "window.no_such=1"])
+    with pytest.raises(Exception, match="no_such"):
+        check_line(["synthgen", "cut", "a", "--out", "b", "--set", "no_such=1"])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -251,3 +259,35 @@ def test_a_category_has_one_diameter_and_an_unseen_member(tmp_path, monkeypatch)
     assert [known[number].is_symmetric for number in (1, 2, 3, 4)] == [False, True, False, True]
     symmetric = np.ptp(meshes[2].vertices_m[:, 0]) - np.ptp(meshes[2].vertices_m[:, 1])
     assert abs(symmetric) < 1e-4 < abs(np.ptp(meshes[1].vertices_m[:, 0]) - np.ptp(meshes[1].vertices_m[:, 1]))
+
+
+def test_stand_ins_differ_from_what_they_stand_for(tmp_path, tug_ply) -> None:
+    """Meshes move by well under a hundredth of their size and change colours; boards are among the backgrounds."""
+    models = tmp_path / "models"
+    models.mkdir()
+    (models / "obj_000003.ply").write_bytes(tug_ply.read_bytes())
+    (models / "models_info.json").write_text("{}")
+    known = load_mesh(models / "obj_000003.ply")
+    stand_ins.alter(models, 1, tmp_path / "altered")
+    stand_ins.alter(models, 1, tmp_path / "again")
+    altered = load_mesh(tmp_path / "altered" / "obj_000003.ply")
+    assert (tmp_path / "again" / "obj_000003.ply").read_bytes() == (
+        tmp_path / "altered" / "obj_000003.ply"
+    ).read_bytes()
+    moved = np.linalg.norm(altered.vertices_m - known.vertices_m, axis=1) / np.linalg.norm(
+        np.ptp(known.vertices_m, axis=0)
+    )
+    assert 0.004 < np.sqrt(np.mean(moved**2)) < 0.008
+    assert np.abs(altered.colours.astype(float) - known.colours).mean() > 5
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").touch()
+    stand_ins.draw_boards(tmp_path / "photos", 0, tmp_path / "behind")
+    sheets = [cv2.imread(str(tmp_path / "behind" / f"board{k}.png")) for k in range(stand_ins.BOARDS)]
+    assert (tmp_path / "behind" / "a.jpg").exists()
+    assert len({sheet.tobytes() for sheet in sheets}) == stand_ins.BOARDS
+    assert all(0.2 < (sheet < 100).mean() < 0.7 for sheet in sheets)
+    frames = tmp_path / "frames"
+    (frames / "models").mkdir(parents=True)
+    (frames / "models" / "obj_000009.ply").touch()
+    stand_ins.make_known(frames, models)
+    assert sorted(p.name for p in (frames / "models").iterdir()) == ["models_info.json", "obj_000003.ply"]
