@@ -82,8 +82,15 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
+def require_models(models: Path) -> None:
+    """End where a folder is no BOP models folder."""
+    if not (models / "models_info.json").is_file():
+        raise SystemExit(f"Error: {models}: no models_info.json in it, expected a BOP models folder")
+
+
 def alter(models: Path, seed: int, out: Path) -> None:
     """Write altered meshes under the names of the known ones."""
+    require_models(models)
     out.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     for file in sorted(models.glob("obj_*.ply")):
@@ -100,7 +107,14 @@ def draw_boards(backgrounds: Path, seed: int, out: Path) -> None:
 
 
 def make_known(frames: Path, models: Path) -> None:
-    """Replace the models of rendered frames."""
+    """Replace the models of rendered frames.
+
+    Raises:
+        SystemExit: One of the folders is not there, or they are the same.
+    """
+    require_models(models)
+    if not frames.is_dir() or (frames / "models").resolve() == models.resolve():
+        raise SystemExit(f"Error: {frames}: expected the folder of rendered frames, beside the models in {models}")
     shutil.rmtree(frames / "models", ignore_errors=True)
     shutil.copytree(models, frames / "models")
 

@@ -38,6 +38,8 @@ def test_train_command(cli, dataset, tmp_path):
     [
         (["--set", "optimiser.momentum=1"], 2, "unknown key optimiser.momentum"),
         (["--set", "optimiser.lr=fast"], 2, "optimiser.lr is 'fast', expected float"),
+        (["--set", "hypothesis.fresh=false", "--set", "hypothesis.stored_share=0.5"], 2, "set hypothesis.fresh=true"),
+        (["--set", "loss.min_closeness=0.1"], 2, "which this network has not: set network.confidence=true"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
         (["--resume"], 1, "no run to resume"),

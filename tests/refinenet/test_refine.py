@@ -13,7 +13,7 @@ from posecore.camera import Camera, project
 from posecore.errors import CameraError, CheckpointError
 from posecore.mesh import Mesh, load_mesh, mesh_digest, save_ply
 from posecore.raster import Rasteriser
-from posecore.window import Window, cut, diameter_window
+from posecore.window import Window, cut, cut_rgb, diameter_window
 from refinenet import checkpoint, geometry
 from refinenet.config import load_config
 from refinenet.errors import RefinementError
@@ -22,7 +22,6 @@ from refinenet.methods import Frame, Request, Status
 from refinenet.network import make_network
 from refinenet.pool import PooledRefiner
 from refinenet.refine import Refiner
-from refinenet.views import cut_patch
 
 from .conftest import HEIGHT_PX, WIDTH_PX, K, background
 
@@ -330,10 +329,10 @@ def test_cut_patch_is_the_cut_of_the_whole_image(frame, mesh):
     for _ in range(20):
         window = Window(x0_px=rng.uniform(-100, 600), y0_px=rng.uniform(-100, 440), side_px=rng.uniform(30, 300))
         whole = cut(image, window, 64, interpolation="area").astype(int)
-        assert np.abs(cut_patch(image, window, 64).astype(int) - whole).max() <= 1
+        assert np.abs(cut_rgb(image, window, 64).astype(int) - whole).max() <= 1
     window = diameter_window(K, truths[0], mesh.center_m, mesh.diameter_m)
-    assert cut_patch(image, window, 64).any()
-    assert not cut_patch(image, Window(x0_px=5000, y0_px=0, side_px=50), 64).any()
+    assert cut_rgb(image, window, 64).any()
+    assert not cut_rgb(image, Window(x0_px=5000, y0_px=0, side_px=50), 64).any()
 
 
 def test_objects_that_were_not_trained_are_refused(mesh, trained):

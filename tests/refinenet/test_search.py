@@ -211,9 +211,11 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
     assert 2 < len(weighed) <= CANDIDATES + 2
     assert {(one.scene_id, one.im_id, one.obj_id) for one in weighed} == {(1, 0, 1)}
     np.testing.assert_array_equal(weighed[-1].T_cam_obj, kept.T_cam_obj)
+    assert read_sidecar(tmp_path / "all.csv")["method"] == "search, all that was weighed"
     assert weighed[-1].score == kept.score > np.median([one.score for one in weighed])
     for method, more, text in (
         ("edge-icp", candidates, "--candidates is for --method search, edge-icp follows one pose"),
+        ("search", ["--candidates", tmp_path / "x.csv"], "--candidates and --out are both"),
         ("region", network, "--method region takes no --checkpoint"),
         ("search", ["--hypotheses", 4], "--hypotheses is for --method network, search does without"),
     ):

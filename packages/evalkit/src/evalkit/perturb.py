@@ -101,7 +101,7 @@ def perturb_dataset(
         Number of lines.
 
     Raises:
-        ConfigError: neither levels nor random ones are wanted.
+        ConfigError: neither levels nor random ones are wanted, or a start would lie behind the camera.
     """
     if not levels and random_up_to is None:
         raise ConfigError(
@@ -125,7 +125,7 @@ def perturb_dataset(
         "dataset": str(dataset.root.resolve()),
         "split": dataset.split,
         "method": START_METHOD,
-        "settings": {"seed": seed, "evalkit": __version__},
+        "settings": {"seed": seed, "depth_stretch": depth_stretch, "evalkit": __version__},
         "perturbation": ({} if protocol is None else {"protocol": protocol}) | {"rows": rows},
     }
     write_results(out, estimates, sidecar)
@@ -154,6 +154,11 @@ def _stretched(
 ) -> tuple[Estimate, Level]:
     """The start with its depth error times a factor, and its level."""
     T = se3.stretched_along_ray(truth.T_cam_obj, start.T_cam_obj, factor)
+    if T[2, 3] <= 0:
+        raise ConfigError(
+            f"--depth-stretch {factor:g}: puts object {start.obj_id} of image {start.im_id}, scene {start.scene_id}, "
+            "behind the camera; lower it or --random-translation"
+        )
     moved = float(np.linalg.norm(T[:3, 3] - truth.T_cam_obj[:3, 3])) / diameter_m
     return replace(start, T_cam_obj=T), replace(level, translation_diameter=moved)
 

@@ -5,7 +5,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Shaped, UInt8
 
 from posecore import se3
 
@@ -134,3 +134,15 @@ def cut(
         borderMode=cv2.BORDER_CONSTANT,
         borderValue=[fill] * 4,
     )
+
+
+def cut_rgb(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
+    """The scene patch of a window, antialiased, black outside the image; touches only the window's part of it."""
+    margin = 8 + int(2 * window.side_px / patch_px)
+    x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
+    x1, y1 = int(x0 + window.side_px + 2 * margin + 2), int(y0 + window.side_px + 2 * margin + 2)
+    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, image.shape[1]), min(y1, image.shape[0])
+    if x1 <= x0 or y1 <= y0:
+        return np.zeros((patch_px, patch_px, 3), np.uint8)
+    part = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
+    return np.asarray(cut(np.ascontiguousarray(image[y0:y1, x0:x1]), part, patch_px, interpolation="area"))

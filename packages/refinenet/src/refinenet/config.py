@@ -388,6 +388,15 @@ class TrainConfig:
         )
 
         _require(
+            self.hypothesis.fresh or not self.hypothesis.stored_share,
+            "hypothesis.stored_share mixes stored hypotheses with fresh ones: set hypothesis.fresh=true as well",
+        )
+        _require(
+            self.network.confidence or not self.loss.min_closeness,
+            "loss.min_closeness leaves hypotheses to the confidence, which this network has not: set "
+            "network.confidence=true as well",
+        )
+        _require(
             self.loss.name != "flow+point" or self.network.kind == "flow",
             f"loss.name is flow+point, but kind {self.network.kind} predicts no flow; use kind flow, or another loss",
         )

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from posecore.camera import crop_K, project
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.window import Window, cut, diameter_window, fixed_window
+from posecore.window import Window, cut_rgb, diameter_window, fixed_window
 
 from refinenet.checkpoint import Provenance
 from refinenet.methods import Frame
@@ -103,7 +103,7 @@ class Viewer:
             failures=failures,
             rows=seen,
             K_crop=np.array([K_crop[int(r)] for r in seen]).reshape(-1, 3, 3),
-            scene_rgb=_stacked([cut_patch(frame.image, windows[int(r)], p) for r in seen], p),
+            scene_rgb=_stacked([cut_rgb(frame.image, windows[int(r)], p) for r in seen], p),
             hypothesis_rgb=rgb[seen],
             depth_m=depth_m[seen],
             inside=inside[seen],
@@ -131,18 +131,6 @@ class Viewer:
         # The same share of the field of view as in training, so that another camera shows the object at the same size.
         scale = float(K[0, 0]) / provenance.camera_fx_px if provenance.camera_fx_px > 0 else 1.0
         return fixed_window(mesh.vertices_m, K, T, side_px * scale)
-
-
-def cut_patch(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
-    """The scene patch of a window, antialiased, black outside the image; touches only the window's part of it."""
-    margin = 8 + int(2 * window.side_px / patch_px)
-    x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
-    x1, y1 = int(x0 + window.side_px + 2 * margin + 2), int(y0 + window.side_px + 2 * margin + 2)
-    x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, image.shape[1]), min(y1, image.shape[0])
-    if x1 <= x0 or y1 <= y0:
-        return np.zeros((patch_px, patch_px, 3), np.uint8)
-    part = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
-    return np.asarray(cut(np.ascontiguousarray(image[y0:y1, x0:x1]), part, patch_px, interpolation="area"))
 
 
 def pixels_inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[Array, "p p"]:

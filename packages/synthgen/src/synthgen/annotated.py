@@ -1,39 +1,37 @@
-"""Training pairs cut out of annotated images, real or rendered, in place of rendered scenes.
+"""Which training pairs to cut out of annotated images, real or rendered; `synthgen.cutter` cuts them.
 
 Hypotheses are drawn around the annotated poses, or read from a result file: a refiner can so be trained on the errors
-that it will meet, a detector's or its own. Silhouettes, depth and contours are those of the mesh at the annotated pose;
-what hides it comes from the dataset's visible masks, or from the other annotated objects where there are none.
+that it will meet, a detector's or its own.
 """
 
 import hashlib
 import math
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from posecore import config as config_tools
-from posecore import se3, shard
+from posecore import se3
 from posecore.bop import BopDataset, GroundTruth, read_results
-from posecore.camera import Camera, crop_K
-from posecore.contour import contour_mask, distance_transform_px, sample_contour
+from posecore.camera import Camera, project
 from posecore.errors import DatasetError
 from posecore.mesh import Mesh
-from posecore.raster import Instance, Rasteriser
-from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
-from posecore.window import Window, cut, diameter_window, fixed_side_px, fixed_window, silhouette_box
+from posecore.window import Window, diameter_window, fixed_side_px, fixed_window, silhouette_box
 
 from synthgen.config import CutConfig
 from synthgen.dataset import DEPTH_STEPS, FINEST_DEPTH_STEP_M, UNITS, package_versions
-from synthgen.draw.sampling import draw_hypothesis
+from synthgen.draw.sampling import draw_hypothesis, share_inside
 from synthgen.draw.streams import Purpose, Subject, stream
 from synthgen.draw.target import hull
-from synthgen.image.region import holds, inside_image
+from synthgen.image.region import holds
 
 Array = np.ndarray
+Pose = Float[Array, "4 4"]
 _CAMERA_PX = 1e-6
 """Cameras that differ by less are one."""
 
@@ -51,19 +49,30 @@ class Pair:
 
     number: int
     gt: GroundTruth
-    T_cam_obj_hypothesis: Float[Array, "4 4"]
+    T_cam_obj_hypothesis: Pose
     window: Window
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Image:
-    """One annotated image and the pairs to be cut out of it; all of them are one scene of the dataset."""
+    """One annotated image and the pairs to be cut out of it.
+
+    Attributes:
+        scene_id, im_id: In the source.
+        number: Position among the source's images: the address of its draws.
+        scene_index: Its scene in the dataset: all images of a BOP scene, where there are several, else it alone.
+        camera: Its camera.
+        annotated: All that is annotated in it with a pose in front of the camera.
+        pairs: What is cut.
+    """
 
     scene_id: int
     im_id: int
+    number: int
     scene_index: int
     camera: Camera
-    pairs: Sequence[Pair]
+    annotated: Sequence[GroundTruth]
+    pairs: Sequence[Pair] = ()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -73,19 +82,126 @@ class Plan:
     Attributes:
         images: In the order in which they fill shards.
         meshes: Objects that have a pair.
-        windows_px: Side of each object's window in the full image.
+        windows_px: Side of each object's fixed window in the full image.
         left_out: Why poses and hypotheses have no pair, with their number.
+        digest: Hash of the source, so that a run goes on with the same one: image files by their size, cameras, poses,
+            hypotheses.
     """
 
     images: Sequence[Image]
     meshes: Mapping[int, Mesh]
     windows_px: Mapping[int, float]
     left_out: Mapping[str, int]
+    digest: str
 
     @property
     def n(self) -> int:
         """Number of pairs."""
         return sum(len(image.pairs) for image in self.images)
+
+
+class _Picker:
+    """What decides the pairs of one image."""
+
+    def __init__(self, config: CutConfig, meshes: Mapping[int, Mesh], images: Sequence[Image]) -> None:
+        self.meshes = meshes
+        self.left_out: Counter[str] = Counter()
+        self._config = config
+        self._hulls_m = {obj_id: hull(mesh) for obj_id, mesh in meshes.items()}
+        self.windows_px = self._fixed_windows(images)
+
+    def usable(self, image: Image, gt: GroundTruth) -> str:
+        """Why an annotated pose is not to be cut; empty where it is."""
+        least = self._config.min_visible
+        if gt.visib_fract is not None and gt.visib_fract < least:
+            return f"poses are visible by less than {least:g}"
+        box = silhouette_box(self._hulls_m[gt.obj_id], image.camera.K, gt.T_cam_obj)
+        if share_inside(box, image.camera) < max(least, 1e-6):
+            return f"poses lie in the image by less than {least:g}"
+        return ""
+
+    def pairs(self, image: Image, given: Sequence[tuple[int, Pose]] | None) -> Iterator[Pair]:
+        """Pairs of an image, with the hypotheses that are given there, or drawn."""
+        why = {gt.gt_index: self.usable(image, gt) for gt in image.annotated}
+        self.left_out.update(reason for reason in why.values() if reason)
+        found = self._drawn(image) if given is None else self._nearest(image, given)
+        for number, gt, guess in found:
+            if why[gt.gt_index]:
+                if given is not None:
+                    self.left_out["hypotheses are of poses that are left out"] += 1
+                continue
+            window = self._window(image.camera, gt, guess)
+            if window is not None:
+                yield Pair(number=number, gt=gt, T_cam_obj_hypothesis=guess, window=window)
+
+    def _fixed_windows(self, images: Sequence[Image]) -> dict[int, float]:
+        """A side for every object, large enough for the nearest pose that is seen under the longest focal length."""
+        nearest: dict[int, tuple[float, Array, float]] = {}
+        for image in images:
+            K = image.camera.K
+            for gt in image.annotated:
+                if self.usable(image, gt):
+                    continue
+                z = float(centre_m(gt.T_cam_obj, self.meshes[gt.obj_id])[2])
+                closeness = max(K[0, 0], K[1, 1]) / z
+                if gt.obj_id not in nearest or closeness > nearest[gt.obj_id][0]:
+                    nearest[gt.obj_id] = closeness, K, z
+        return {
+            obj_id: fixed_side_px(self._hulls_m[obj_id] - self.meshes[obj_id].center_m, K, z, self._config.padding)
+            for obj_id, (_, K, z) in sorted(nearest.items())
+        }
+
+    def _drawn(self, image: Image) -> Iterator[tuple[int, GroundTruth, Pose]]:
+        config = self._config
+        for gt in image.annotated:
+            for number in range(config.hypotheses_per_pose):
+                address = (image.number, gt.gt_index, number)
+                rng = stream(config.seed, Purpose.ANNOTATED, Subject.HYPOTHESIS, *address)
+                yield number, gt, draw_hypothesis(rng, config.perturbation, gt.T_cam_obj, self.meshes[gt.obj_id])
+
+    def _nearest(self, image: Image, given: Sequence[tuple[int, Pose]]) -> Iterator[tuple[int, GroundTruth, Pose]]:
+        """Hypotheses with the annotated instance whose centre lies nearest to theirs."""
+        seen: Counter[int] = Counter()
+        for obj_id, guess in given:
+            instances = [gt for gt in image.annotated if gt.obj_id == obj_id]
+            if not instances:
+                self.left_out["hypotheses are of objects that are not annotated there"] += 1
+                continue
+            mesh = self.meshes[obj_id]
+            away_m = [np.linalg.norm(centre_m(gt.T_cam_obj, mesh) - centre_m(guess, mesh)) for gt in instances]
+            gt = instances[int(np.argmin(away_m))]
+            yield seen[gt.gt_index], gt, guess
+            seen[gt.gt_index] += 1
+
+    def _window(self, camera: Camera, gt: GroundTruth, guess: Pose) -> Window | None:
+        """The window of a pair, None where it does not hold both silhouettes or one of them is too small."""
+        mesh, hull_m, config = self.meshes[gt.obj_id], self._hulls_m[gt.obj_id], self._config
+        boxes = [silhouette_box(hull_m, camera.K, T) for T in (gt.T_cam_obj, guess)]
+        if not np.isfinite(boxes).all():
+            self.left_out["pairs reach behind the camera"] += 1
+            return None
+        if config.window == "fixed":
+            window = fixed_window(hull_m, camera.K, guess, self.windows_px[gt.obj_id])
+        else:
+            window = diameter_window(camera.K, guess, mesh.center_m, mesh.diameter_m, config.scale)
+        if not all(holds(window, box) for box in boxes):
+            self.left_out["pairs do not fit into their windows (more scale, or padding of fixed ones, helps)"] += 1
+            return None
+        area_px = min(_hull_area_px(camera.K, se3.apply(T, hull_m)) for T in (gt.T_cam_obj, guess))
+        if area_px * min(1.0, (config.patch_px / window.side_px) ** 2) < config.min_area_px:
+            self.left_out[f"pairs show an object on less than {config.min_area_px:g} pixels"] += 1
+            return None
+        return window
+
+
+def centre_m(T_cam_obj: Pose, mesh: Mesh) -> Float[Array, "3"]:
+    """The object's box centre in the camera frame."""
+    return np.asarray(T_cam_obj[:3, :3] @ mesh.center_m + T_cam_obj[:3, 3])
+
+
+def _hull_area_px(K: Float[Array, "3 3"], points_m: Float[Array, "h 3"]) -> float:
+    """Area of the convex hull of a silhouette."""
+    return float(cv2.contourArea(cv2.convexHull(project(K, points_m).astype(np.float32))))
 
 
 def plan(dataset: BopDataset, config: CutConfig, hypotheses: str | Path | None = None) -> Plan:
@@ -100,197 +216,129 @@ def plan(dataset: BopDataset, config: CutConfig, hypotheses: str | Path | None =
         DatasetError: There is no ground truth, images are of several sizes, or nothing is left to cut.
         ResultFileError: The result file is broken, or of other images.
     """
+    digest = hashlib.sha256()
     given = None if hypotheses is None else _hypotheses_by_image(dataset, hypotheses)
-    left_out: Counter[str] = Counter()
-    poses: list[tuple[int, int, Camera, list[GroundTruth]]] = []
-    for scene_id in dataset.scene_ids:
-        for im_id in dataset.im_ids(scene_id):
-            if given is None or (scene_id, im_id) in given:
-                usable = _usable(dataset.gt(scene_id, im_id), config, left_out)
-                poses.append((scene_id, im_id, dataset.camera(scene_id, im_id), usable))
-    _require_one_size(dataset, poses)
-    meshes = {obj_id: dataset.mesh(obj_id) for obj_id in sorted({gt.obj_id for *_, all_ in poses for gt in all_})}
-    hulls_m = {obj_id: hull(mesh) for obj_id, mesh in meshes.items()}
-    windows_px = _windows_px(poses, meshes, hulls_m, config)
-    images = []
-    order = stream(config.seed, Purpose.ANNOTATED, Subject.KIND).permutation(len(poses))
-    for scene_index in order.tolist():
-        scene_id, im_id, camera, usable = poses[scene_index]
-        address = (config.seed, Purpose.ANNOTATED, Subject.HYPOTHESIS, scene_index)
-        found = (
-            _drawn(usable, meshes, config, address)
-            if given is None
-            else _nearest(given[scene_id, im_id], usable, meshes, left_out)
-        )
-        pairs: list[Pair] = []
-        for number, gt, guess in found:
-            window = _window(
-                gt, guess, meshes[gt.obj_id], hulls_m[gt.obj_id], camera, windows_px[gt.obj_id], config, left_out
-            )
-            if window is not None:
-                pairs.append(Pair(number=number, gt=gt, T_cam_obj_hypothesis=guess, window=window))
+    images = [
+        one
+        for one in _images(dataset, None if given is None else set(given), config.images)
+        if given is None or (one.scene_id, one.im_id) in given
+    ]
+    _require_one_size(dataset, images, one_focal_length=config.window == "fixed")
+    meshes = {i: dataset.mesh(i) for i in sorted({gt.obj_id for image in images for gt in image.annotated})}
+    picker = _Picker(config, meshes, images)
+    planned = []
+    for image in images:
+        there = None if given is None else given[image.scene_id, image.im_id]
+        pairs = tuple(picker.pairs(image, there))
         if pairs:
-            images.append(
-                Image(scene_id=scene_id, im_id=im_id, scene_index=scene_index, camera=camera, pairs=tuple(pairs))
-            )
-    if not images:
-        why = "; ".join(f"{count} {reason}" for reason, count in left_out.most_common()) or "no pose is annotated"
-        raise DatasetError(f"{dataset.split_path}: there is no pair to cut ({why})")
-    kept = {pair.gt.obj_id for image in images for pair in image.pairs}
+            planned.append(replace(image, pairs=pairs))
+            digest.update(_described(dataset, image, pairs))
+    if not planned:
+        reasons = "; ".join(f"{count} {reason}" for reason, count in picker.left_out.most_common())
+        raise DatasetError(f"{dataset.split_path}: there is no pair to cut ({reasons or 'no pose is annotated'})")
+    kept = {pair.gt.obj_id for image in planned for pair in image.pairs}
     return Plan(
-        images=tuple(images),
+        images=tuple(planned),
         meshes={obj_id: mesh for obj_id, mesh in meshes.items() if obj_id in kept},
-        windows_px={obj_id: side for obj_id, side in windows_px.items() if obj_id in kept},
-        left_out=dict(left_out),
+        windows_px={obj_id: side for obj_id, side in picker.windows_px.items() if obj_id in kept},
+        left_out=dict(picker.left_out),
+        digest=digest.hexdigest(),
     )
 
 
-def _require_one_size(dataset: BopDataset, poses: Sequence[tuple[int, int, Camera, list[GroundTruth]]]) -> None:
-    first: dict[tuple[int, int], str] = {}
-    for scene_id, im_id, camera, _ in poses:
-        first.setdefault((camera.width_px, camera.height_px), f"image {im_id} of scene {scene_id}")
-    if len(first) > 1:
-        (size, image), (other, different) = list(first.items())[:2]
+def _images(dataset: BopDataset, wanted: set[tuple[int, int]] | None, most: int) -> list[Image]:
+    """Images that may have a pair, evenly spread where there are more than `most`; 0 takes all."""
+    listed = [(scene_id, im_id) for scene_id in dataset.scene_ids for im_id in dataset.im_ids(scene_id)]
+    numbered = [(number, *one) for number, one in enumerate(listed) if wanted is None or one in wanted]
+    if most and len(numbered) > most:
+        numbered = [numbered[i] for i in np.linspace(0, len(numbered) - 1, most).round().astype(int)]
+    scenes = {scene_id: place for place, scene_id in enumerate(dataset.scene_ids)}
+    images = []
+    for number, scene_id, im_id in numbered:
+        all_ = [gt for gt in dataset.gt(scene_id, im_id) if gt.has_pose]
+        meshes = {gt.obj_id: dataset.mesh(gt.obj_id) for gt in all_}
+        annotated = [replace(gt, T_cam_obj=rigid(gt.T_cam_obj)) for gt in all_]
+        images.append(
+            Image(
+                scene_id=scene_id,
+                im_id=im_id,
+                number=number,
+                scene_index=scenes[scene_id] if len(scenes) > 1 else number,
+                camera=dataset.camera(scene_id, im_id),
+                annotated=[gt for gt in annotated if centre_m(gt.T_cam_obj, meshes[gt.obj_id])[2] > 0],
+            )
+        )
+    return images
+
+
+def _described(dataset: BopDataset, image: Image, pairs: Sequence[Pair]) -> bytes:
+    """What decides the pairs of an image, in few bytes: its file by its size, its masks by one of them."""
+    file = dataset.image_file(image.scene_id, image.im_id)
+    size = file.path.stat().st_size if file.size is None else file.size
+    mask = dataset.mask(image.scene_id, image.im_id, pairs[0].gt.gt_index, visible=True)
+    seen = None if mask is None else int(mask.sum())
+    poses = [image.camera.K, *(gt.T_cam_obj for gt in image.annotated), *(pair.T_cam_obj_hypothesis for pair in pairs)]
+    text = f"{image.scene_id} {image.im_id} {size} {seen} {[gt.obj_id for gt in image.annotated]}"
+    return text.encode() + b"".join(np.ascontiguousarray(np.round(one, 9) + 0.0).tobytes() for one in poses)
+
+
+def _require_one_size(dataset: BopDataset, images: Sequence[Image], *, one_focal_length: bool) -> None:
+    first: dict[tuple[float, ...], str] = {}
+    for image in images:
+        camera = image.camera
+        focal = (round(camera.K[0, 0], 3), round(camera.K[1, 1], 3)) if one_focal_length else ()
+        first.setdefault((camera.width_px, camera.height_px, *focal), f"image {image.im_id} of scene {image.scene_id}")
+    if len(first) <= 1:
+        return
+    (size, where), (other, different) = list(first.items())[:2]
+    if size[:2] != other[:2]:
         raise DatasetError(
-            f"{dataset.split_path}: {image} is {size[0]} x {size[1]} pixels and {different} {other[0]} x {other[1]}, "
+            f"{dataset.split_path}: {where} is {size[0]} x {size[1]} pixels and {different} {other[0]} x {other[1]}, "
             "expected images of one size; cut other sizes in a dataset or --sensor of their own"
         )
+    raise DatasetError(
+        f"{dataset.split_path}: {where} has fx {size[2]:g} and {different} {other[2]:g}, expected one focal length for "
+        "fixed windows; leave --set window=fixed out, or cut each camera as a dataset of its own"
+    )
 
 
-def _hypotheses_by_image(
-    dataset: BopDataset, file: str | Path
-) -> dict[tuple[int, int], list[tuple[int, Float[Array, "4 4"]]]]:
-    """Object and pose of every line of a result file, by image."""
+def _hypotheses_by_image(dataset: BopDataset, file: str | Path) -> dict[tuple[int, int], list[tuple[int, Pose]]]:
+    """Object and pose of every line of a result file, by image; equal ones once."""
     by_image = defaultdict(list)
+    seen: set[tuple[int, int, int, bytes]] = set()
     for one in read_results(file, dataset):
-        by_image[one.scene_id, one.im_id].append((one.obj_id, rigid(one.T_cam_obj)))
+        pose = rigid(one.T_cam_obj)
+        key = one.scene_id, one.im_id, one.obj_id, pose.tobytes()
+        if key not in seen:
+            seen.add(key)
+            by_image[one.scene_id, one.im_id].append((one.obj_id, pose))
     if not by_image:
         raise DatasetError(f"{file}: holds no pose, expected hypotheses; leave --hypotheses out to have them drawn")
     return by_image
 
 
-def rigid(T: Float[Array, "4 4"]) -> Float[Array, "4 4"]:
+def rigid(T: Pose) -> Pose:
     """The pose with the nearest rotation: files give only some digits of theirs."""
     return se3.make_T(se3.nearest_rotation(T[:3, :3]), T[:3, 3])
 
 
-def _usable(all_: Sequence[GroundTruth], config: CutConfig, left_out: Counter[str]) -> list[GroundTruth]:
-    usable = []
-    for gt in all_:
-        if not gt.has_pose or gt.T_cam_obj[2, 3] <= 0:
-            left_out["poses are unknown or behind the camera"] += 1
-        elif gt.visib_fract is not None and gt.visib_fract < config.min_visible:
-            left_out[f"poses are visible by less than {config.min_visible:g}"] += 1
-        else:
-            usable.append(
-                GroundTruth(
-                    obj_id=gt.obj_id, T_cam_obj=rigid(gt.T_cam_obj), visib_fract=gt.visib_fract, gt_index=gt.gt_index
-                )
-            )
-    return usable
-
-
-def _windows_px(
-    poses: Sequence[tuple[int, int, Camera, list[GroundTruth]]],
-    meshes: Mapping[int, Mesh],
-    hulls_m: Mapping[int, Array],
-    config: CutConfig,
-) -> dict[int, float]:
-    """The fixed window of every object: large enough for the nearest of its poses under the longest focal length."""
-    nearest: dict[int, tuple[float, Array]] = {}
-    for _, _, camera, usable in poses:
-        for gt in usable:
-            z = float((gt.T_cam_obj[:3, :3] @ meshes[gt.obj_id].center_m + gt.T_cam_obj[:3, 3])[2])
-            focal = max(camera.K[0, 0], camera.K[1, 1])
-            if gt.obj_id not in nearest or focal / z > nearest[gt.obj_id][0]:
-                nearest[gt.obj_id] = (focal / z, np.append(camera.K.ravel(), z))
-    return {
-        obj_id: fixed_side_px(
-            hulls_m[obj_id] - meshes[obj_id].center_m, found[:9].reshape(3, 3), float(found[9]), config.padding
-        )
-        for obj_id, (_, found) in sorted(nearest.items())
-    }
-
-
-def _drawn(
-    usable: Sequence[GroundTruth],
-    meshes: Mapping[int, Mesh],
-    config: CutConfig,
-    address: tuple[int, Purpose, Subject, int],
-) -> Iterator[tuple[int, GroundTruth, Float[Array, "4 4"]]]:
-    for gt in usable:
-        for number in range(config.hypotheses_per_pose):
-            rng = stream(*address, gt.gt_index, number)
-            yield number, gt, draw_hypothesis(rng, config.perturbation, gt.T_cam_obj, meshes[gt.obj_id])
-
-
-def _nearest(
-    guesses: Sequence[tuple[int, Float[Array, "4 4"]]],
-    usable: Sequence[GroundTruth],
-    meshes: Mapping[int, Mesh],
-    left_out: Counter[str],
-) -> Iterator[tuple[int, GroundTruth, Float[Array, "4 4"]]]:
-    """Hypotheses with the annotated instance whose centre lies nearest to theirs."""
-    seen: Counter[int] = Counter()
-    for obj_id, guess in guesses:
-        instances = [gt for gt in usable if gt.obj_id == obj_id]
-        if not instances:
-            left_out["hypotheses are of objects that are not annotated there, or left out"] += 1
-            continue
-        center_m = meshes[obj_id].center_m
-        gt = min(instances, key=lambda one: _distance_m(one.T_cam_obj, guess, center_m))
-        yield seen[gt.gt_index], gt, guess
-        seen[gt.gt_index] += 1
-
-
-def _distance_m(T: Float[Array, "4 4"], other: Float[Array, "4 4"], point_m: Float[Array, "3"]) -> float:
-    difference = T - other
-    return float(np.linalg.norm(difference[:3, :3] @ point_m + difference[:3, 3]))
-
-
-def _window(
-    gt: GroundTruth,
-    guess: Float[Array, "4 4"],
-    mesh: Mesh,
-    hull_m: Float[Array, "h 3"],
-    camera: Camera,
-    side_px: float,
-    config: CutConfig,
-    left_out: Counter[str],
-) -> Window | None:
-    """The window of a pair, None where it does not hold both silhouettes or one of them is too small."""
-    boxes = [silhouette_box(hull_m, camera.K, T) for T in (gt.T_cam_obj, guess)]
-    if not np.isfinite(boxes).all():
-        left_out["pairs reach behind the camera"] += 1
-        return None
-    if config.window == "fixed":
-        window = fixed_window(hull_m, camera.K, guess, side_px)
-    else:
-        window = diameter_window(camera.K, guess, mesh.center_m, mesh.diameter_m, config.scale)
-    if not all(holds(window, box) for box in boxes):
-        left_out["pairs do not fit into their windows (more scale, or padding of fixed ones, gives larger ones)"] += 1
-        return None
-    shortest_px = min(max(box[2] - box[0], box[3] - box[1]) for box in boxes) * config.patch_px / window.side_px
-    if shortest_px < config.min_side_px:
-        left_out[f"pairs show less than {config.min_side_px:g} px of an object"] += 1
-        return None
-    return window
-
-
-def make_card(
-    dataset: BopDataset, planned: Plan, config: CutConfig, hypotheses: str | Path | None = None
-) -> dict[str, Any]:
+def make_card(dataset: BopDataset, planned: Plan, config: CutConfig, *, drawn: bool = True) -> dict[str, Any]:
     """The data card: nothing in it depends on time or machine.
 
-    Raises:
-        DatasetError: The objects are too far away to be stored.
+    Args:
+        dataset: Images.
+        planned: What is cut.
+        config: How.
+        drawn: Whether hypotheses were drawn, or read from a file.
     """
     camera = planned.images[0].camera
     deepest_m = max(
-        float(pose[2, 3]) + 2 * planned.meshes[pair.gt.obj_id].diameter_m
+        float(centre_m(T, dataset.mesh(obj_id))[2]) + dataset.mesh(obj_id).diameter_m
         for image in planned.images
-        for pair in image.pairs
-        for pose in (pair.gt.T_cam_obj, pair.T_cam_obj_hypothesis)
+        for obj_id, T in (
+            *((gt.obj_id, gt.T_cam_obj) for gt in image.annotated),
+            *((pair.gt.obj_id, pair.T_cam_obj_hypothesis) for pair in image.pairs),
+        )
     )
     shared = all(np.abs(image.camera.K - camera.K).max() < _CAMERA_PX for image in planned.images)
     return {
@@ -305,9 +353,8 @@ def make_card(
             "dataset": dataset.name,
             "split": dataset.split,
             "images": len(planned.images),
-            "hypotheses_sha256": None
-            if hypotheses is None
-            else hashlib.sha256(Path(hypotheses).read_bytes()).hexdigest(),
+            "hypotheses": "drawn" if drawn else "given",
+            "sha256": planned.digest,
             "left_out": dict(planned.left_out),
         },
         "cut": config_tools.to_dict(config),
@@ -335,127 +382,3 @@ def make_card(
         "units": UNITS,
         "versions": package_versions(),
     }
-
-
-def cut_pairs(
-    dataset: BopDataset,
-    planned: Plan,
-    config: CutConfig,
-    writer: shard.ShardWriter,
-    on_shard: Callable[[int], None] = lambda n: None,
-) -> None:
-    """Cut every pair whose shard is missing or damaged, and commit shard by shard.
-
-    Args:
-        dataset: Images.
-        planned: What.
-        config: The recipe that it was planned with.
-        writer: Where to.
-        on_shard: Told the pairs of every shard, those that were there too.
-    """
-    there = set(writer.committed()) - set(writer.damaged())
-    seen = {gt.obj_id for image in planned.images for gt in dataset.gt(image.scene_id, image.im_id) if gt.has_pose}
-    with Rasteriser({obj_id: dataset.mesh(obj_id) for obj_id in sorted(seen)}) as rasteriser:
-        cutter = _Cutter(dataset, config, rasteriser)
-        listed = [(image, pair) for image in planned.images for pair in image.pairs]
-        for shard_id in range(shard.n_shards(writer.card)):
-            part = listed[shard_id * config.shard_size : (shard_id + 1) * config.shard_size]
-            if shard_id not in there:
-                rows = [cutter.sample(image, pair) for image, pair in part]
-                arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-                writer.commit(writer.encode(shard_id, arrays))
-            on_shard(len(part))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Layers:
-    """One image, with what hides and surrounds its objects.
-
-    Attributes:
-        rgb: The image.
-        depth_m: Camera z of the nearest annotated object.
-        front: Pixels that show any of them.
-        hidden: By position in the ground truth, pixels of the object's silhouette that show something else.
-    """
-
-    rgb: Array
-    depth_m: Float[Array, "h w"]
-    front: Bool[Array, "h w"]
-    hidden: Mapping[int, Bool[Array, "h w"]]
-
-
-class _Cutter:
-    """Cuts pairs; keeps the layers of the image that it cut last."""
-
-    def __init__(self, dataset: BopDataset, config: CutConfig, rasteriser: Rasteriser) -> None:
-        self._dataset = dataset
-        self._config = config
-        self._rasteriser = rasteriser
-        self._last: tuple[Image, _Layers] | None = None
-
-    def sample(self, image: Image, pair: Pair) -> dict[str, Array]:
-        """Every field of the shard table."""
-        if self._last is None or self._last[0] is not image:
-            self._last = (image, self._layers(image))
-        layers = self._last[1]
-        p, gt, window, n = self._config.patch_px, pair.gt, pair.window, self._config.contour_points
-        K_crop = crop_K(image.camera.K, window, p)
-        truth = self._rasteriser.render(gt.obj_id, K_crop, gt.T_cam_obj[None], p, p, rgb=False).depth_m[0]
-        guess = self._rasteriser.render(gt.obj_id, K_crop, pair.T_cam_obj_hypothesis[None], p, p)
-        assert guess.rgb is not None
-        depth = guess.depth_m[0]
-        amodal, shape = truth > 0, depth > 0
-        hidden = cut(layers.hidden[gt.gt_index].astype(np.uint8), window, p, interpolation="nearest") > 0
-        visible = amodal & inside_image(window, p, image.camera) & ~hidden
-        other_m = cut(layers.depth_m, window, p, interpolation="nearest")
-        shown = cut(layers.front.astype(np.uint8), window, p, interpolation="nearest") > 0
-        other_m = np.where(shown & ~(amodal & ~hidden), other_m, np.float32(0))
-        scene_depth_m = np.where(visible, truth, other_m).astype(np.float32)
-        mask = amodal * BIT_OBJECT + visible * BIT_VISIBLE + (scene_depth_m > 0) * BIT_FOREGROUND
-        rng = stream(self._config.seed, Purpose.ANNOTATED, Subject.CONTOUR, image.scene_index, gt.gt_index, pair.number)
-        values = {
-            "scene_rgb": cut(layers.rgb, window, p, interpolation="area"),
-            "hypothesis_rgb": guess.rgb[0],
-            "scene_depth_m": scene_depth_m,
-            "hypothesis_depth_m": depth,
-            "scene_mask": mask.astype(np.uint8),
-            "scene_contour_cam_m": sample_contour(amodal, truth, K_crop, n, rng),
-            "hypothesis_contour_cam_m": sample_contour(shape, depth, K_crop, n, rng),
-            "scene_distance_px": distance_transform_px(contour_mask(amodal)),
-            "hypothesis_distance_px": distance_transform_px(contour_mask(shape)),
-            "T_cam_obj": gt.T_cam_obj,
-            "T_cam_obj_hypothesis": pair.T_cam_obj_hypothesis,
-            "K": image.camera.K,
-            "K_crop": K_crop,
-            "window_px": window.as_array(),
-            "visible_fraction": np.float32(visible.sum() / amodal.sum()),
-            "obj_id": np.int32(gt.obj_id),
-            "scene_index": np.int64(image.scene_index),
-            "rejected": np.int32(0),
-        }
-        return {name: np.asarray(value) for name, value in values.items()}
-
-    def _layers(self, image: Image) -> _Layers:
-        """Read an image and its masks, and draw its annotated objects."""
-        scene_id, im_id, camera = image.scene_id, image.im_id, image.camera
-        width, height = camera.width_px, camera.height_px
-        all_ = [gt for gt in self._dataset.gt(scene_id, im_id) if gt.has_pose]
-        drawn = self._rasteriser.render_scene(
-            [Instance(obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj) for gt in all_], camera.K, width, height, rgb=False
-        )
-        wanted = {pair.gt.gt_index for pair in image.pairs}
-        front, hidden = np.zeros((height, width), bool), {}
-        for index, gt in enumerate(all_):
-            seen = self._dataset.mask(scene_id, im_id, gt.gt_index, visible=True)
-            if seen is None:
-                seen = drawn.instance == index
-            front |= seen
-            if gt.gt_index in wanted:
-                whole = self._rasteriser.render(gt.obj_id, camera.K, gt.T_cam_obj[None], width, height, rgb=False)
-                hidden[gt.gt_index] = whole.mask[0] & ~seen
-        return _Layers(
-            rgb=self._dataset.rgb(scene_id, im_id),
-            depth_m=drawn.depth_m,
-            front=front & (drawn.depth_m > 0),
-            hidden=hidden,
-        )

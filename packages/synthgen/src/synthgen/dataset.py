@@ -95,12 +95,12 @@ def load_symmetries(path: str | None, meshes: Mapping[int, Mesh]) -> dict[int, M
         return load_models_info(numbered)
 
 
-def estimated_bytes(config: SynthConfig, n: int) -> int:
+def estimated_bytes(patch_px: int, contour_points: int, n: int) -> int:
     """Rough size of a dataset on disk without rendering anything; `synthgen.run.estimate` measures.
 
     `benchmarks/shard_codecs.py` finds 2.2 to 2.3 bytes a patch pixel at 224 px, and 10 a contour point.
     """
-    return round(n * (2.3 * config.patch_px**2 + 20 * config.contour_points))
+    return round(n * (2.3 * patch_px**2 + 20 * contour_points))
 
 
 def versions(config: SynthConfig) -> dict[str, str]:

@@ -14,7 +14,7 @@ from synthgen.export import complete_dataset, model_keys
 
 Array = np.ndarray
 MODELS_INFO = "models/models_info.json"
-_SAME = ("schema", "schema_version", "patch_px", "contour_points", "depth_step_m", "units")
+_SAME = ("schema", "schema_version", "patch_px", "contour_points", "units")
 _CAMERA = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
 
@@ -27,7 +27,7 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
     parts = [complete_dataset(url) for url in urls]
     first = parts[0]
     digests: dict[str, str] = {}
-    objects: dict[int, tuple[str, str]] = {}
+    objects: dict[int, tuple[str, str, str]] = {}
     for part in parts:
         if part.digest in digests:
             raise ShardError(f"{part.url}: holds the same pairs as {digests[part.digest]}; name it once")
@@ -41,12 +41,13 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
         infos = json.loads(part.file(MODELS_INFO))
         for obj_id, mesh in load_meshes(part).items():
             symmetries = {key: value for key, value in infos[str(obj_id)].items() if key.startswith("symmetries")}
-            described = mesh_digest(mesh), json.dumps(symmetries, sort_keys=True)
-            if objects.setdefault(obj_id, described) != described:
-                what = "another mesh" if objects[obj_id][0] != described[0] else "other symmetries"
+            described = mesh_digest(mesh), json.dumps(symmetries, sort_keys=True), part.url
+            known = objects.setdefault(obj_id, described)
+            if known[:2] != described[:2]:
+                what = "another mesh" if known[0] != described[0] else "other symmetries"
                 raise ShardError(
-                    f"{part.url}: object {obj_id} has {what} than in the datasets before; rename its file, whose "
-                    "number is the object's, or make all from the same one"
+                    f"{part.url}: object {obj_id} has {what} than in {known[2]}; rename its file, whose number is the "
+                    "object's, or make all datasets from the same one"
                 )
     return parts
 
@@ -70,6 +71,7 @@ def merged_card(parts: Sequence[ShardReader]) -> dict[str, Any]:
         "n": sum(part.n for part in parts),
         "shard_size": cards[0]["shard_size"],
         **{key: cards[0][key] for key in _SAME if not key.startswith("schema")},
+        "depth_step_m": max(card["depth_step_m"] for card in cards),
         "seed": [card["seed"] for card in cards],
         "windows": windows.pop() if len(windows) == 1 else "mixed",
         "objects": dict(sorted(objects.items(), key=lambda item: int(item[0]))),
@@ -79,7 +81,9 @@ def merged_card(parts: Sequence[ShardReader]) -> dict[str, Any]:
     }
 
 
-def merge(parts: Sequence[ShardReader], writer: ShardWriter, on_shard: Callable[[int], None] = lambda n: None) -> None:
+def write_merged(
+    parts: Sequence[ShardReader], writer: ShardWriter, on_shard: Callable[[int], None] = lambda n: None
+) -> None:
     """Write the pairs of all parts, one part after the other; scenes are numbered on, so that none is two.
 
     Shards that are there are left as they are.

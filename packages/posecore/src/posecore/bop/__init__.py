@@ -13,6 +13,7 @@ from posecore.bop.results import (
     table_of,
     write_results,
 )
+from posecore.bop.splits import splits_of
 from posecore.bop.writer import (
     BopWriter,
     FrameEntry,
@@ -41,6 +42,7 @@ __all__ = [
     "read_sidecar",
     "scene_folder",
     "sidecar_path",
+    "splits_of",
     "symmetry_transforms",
     "table_of",
     "visible_targets",

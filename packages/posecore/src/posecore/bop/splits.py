@@ -48,13 +48,18 @@ def _is_split(folder: Path) -> bool:
     return folder.is_dir() and (has_scenes(folder) or bool(shard_files(folder)))
 
 
+def splits_of(root: str | Path) -> list[str]:
+    """Split folders of a dataset by name; none where there is no dataset, or its shards lie in no folder."""
+    return sorted(path.name for path in Path(root).iterdir() if _is_split(path)) if Path(root).is_dir() else []
+
+
 def choose_split(root: Path) -> str:
     """The split that is meant where none is named; "." for shards without a split folder.
 
     Raises:
         DatasetError: there is none, or several and none preferred.
     """
-    splits = sorted(path.name for path in root.iterdir() if _is_split(path))
+    splits = splits_of(root)
     for name in PREFERRED_SPLITS:
         typed = [split for split in splits if split == name or split.startswith(f"{name}_")]
         if name in splits or len(typed) == 1:

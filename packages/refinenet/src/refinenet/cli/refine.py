@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
 
 SHOWN_FAILURES = 5
-SEARCH = "search"
 
 
 @click.command()
@@ -102,8 +101,10 @@ def refine(
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
-    if candidates is not None and method != SEARCH:
-        raise click.UsageError(f"--candidates is for --method {SEARCH}, {method} follows one pose")
+    if candidates is not None and method not in WITH_NETWORK:
+        raise click.UsageError(f"--candidates is for --method {WITH_NETWORK[0]}, {method} follows one pose")
+    if candidates is not None and candidates.resolve() == out.resolve():
+        raise click.UsageError(f"--candidates and --out are both {out}: name two files")
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 
@@ -149,7 +150,8 @@ def refine(
     )  # fmt: skip
     write_results(out, result.estimates, sidecar)
     if candidates is not None:
-        write_results(candidates, result.tried)
+        of_all = {key: sidecar[key] for key in ("dataset", "split", "settings", "init")}
+        write_results(candidates, result.tried, of_all | {"method": f"{sidecar['method']}, all that was weighed"})
     of_line = {start.line: start for start in starts}
     for line, why in list(result.failures.items())[:SHOWN_FAILURES]:
         start = of_line[line]

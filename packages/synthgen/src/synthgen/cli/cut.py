@@ -13,7 +13,7 @@ from synthgen.cli.console import progress_bar, stoppable
 @click.option(
     "--split",
     metavar="NAME",
-    help="Split folder of the dataset. [test, val, train_pbr, train or the only one, in this order]",
+    help="Split folder of the dataset. [the only one]",
 )
 @click.option("--sensor", metavar="NAME", help="Which camera of several, as in scene_camera_NAME.json.")
 @click.option(
@@ -23,16 +23,17 @@ from synthgen.cli.console import progress_bar, stoppable
     help="BOP result file: each line is a hypothesis of the nearest annotated instance of its object; images without "
     "a line give no pair. [drawn around the annotated poses]",
 )
+@click.option("--images", type=click.IntRange(0), help="Most images to cut, evenly spread over all; 0 cuts all. [0]")
 @click.option("--patch-px", type=int, help="Side of the patches. [224]")
 @click.option("--hypotheses-per-pose", type=int, help="Hypotheses drawn around each annotated pose. [8]")
-@click.option("--seed", type=click.IntRange(0), help="Of hypotheses and of the order of images. [0]")
+@click.option("--seed", type=click.IntRange(0), help="Of drawn hypotheses. [0]")
 @click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="KEY=VALUE",
     help="Change one configuration key: seed, patch_px, contour_points, hypotheses_per_pose, shard_size, min_visible, "
-    "min_side_px, window, scale, padding, perturbation.max_angle_deg, ... Repeatable; last wins.",
+    "min_area_px, images, window, scale, padding, perturbation.max_angle_deg, ... Repeatable; last wins.",
 )
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def cut(
@@ -52,32 +53,43 @@ def cut(
     on images that you report results on.
 
     \b
-    synthgen cut ycbv --split train_real --out shards
+    synthgen cut ycbv --split train_real --images 5000 --out shards
     synthgen cut my_images --out shards --hypotheses detections.csv
     synthgen cut my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
     """
     from posecore import config as config_tools
-    from posecore.bop import BopDataset
+    from posecore.bop import BopDataset, splits_of
     from posecore.shard import ShardWriter
 
     from synthgen import annotated
     from synthgen.config import CutConfig
-    from synthgen.dataset import model_files
+    from synthgen.cutter import cut_pairs
+    from synthgen.dataset import estimated_bytes, model_files
+    from synthgen.machine import size_text
     from synthgen.run import lock
+    from synthgen.run.estimate import check_free_space
 
     given = {key: value for key, value in values.items() if value is not None}
     mapping = config_tools.apply_overrides({}, overrides) | given
     config = config_tools.build(CutConfig, mapping, "--set")
+    if split is None and len(there := splits_of(dataset)) > 1:
+        raise click.UsageError(
+            f"{dataset} has the splits {', '.join(there)}: name one with --split, not one that you report results on"
+        )
     images = BopDataset(dataset, split, sensor)
     planned = annotated.plan(images, config, hypotheses)
     for reason, count in sorted(planned.left_out.items()):
         click.echo(f"{images.split_path}: left out: {count} {reason}", err=True)
     with lock.held(out), stoppable(out):
-        writer = ShardWriter.create(out, annotated.make_card(images, planned, config, hypotheses))
+        writer = ShardWriter.create(out, annotated.make_card(images, planned, config, drawn=hypotheses is None))
+        missing = planned.n - len(writer.committed()) * config.shard_size
+        size = estimated_bytes(config.patch_px, config.contour_points, max(0, missing))
+        check_free_space(out, size)
+        click.echo(f"{out}: {planned.n} pairs of {images.split_path}, about {size_text(size)} more", err=True)
         infos = images.models_info
         for key, data in model_files(planned.meshes, {i: infos[i] for i in planned.meshes if i in infos}).items():
             writer.add_file(key, data)
         with progress_bar(quiet) as bar:
             task = bar.add_task("pairs", total=planned.n)
-            annotated.cut_pairs(images, planned, config, writer, lambda count: bar.advance(task, count))
+            cut_pairs(images, planned, config, writer, lambda count: bar.advance(task, count))
     click.echo(f"{out}: complete, {planned.n} pairs of {len(planned.images)} images", err=True)

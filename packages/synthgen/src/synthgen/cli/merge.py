@@ -23,7 +23,7 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
         raise click.UsageError("give two datasets or more")
     from posecore.shard import ShardWriter
 
-    from synthgen.merge import merge, merged_card, open_parts
+    from synthgen.merge import merged_card, open_parts, write_merged
     from synthgen.run import lock
 
     parts = open_parts(datasets)
@@ -31,5 +31,5 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
     with lock.held(out), stoppable(out), progress_bar(quiet) as bar:
         writer = ShardWriter.create(out, card)
         task = bar.add_task("pairs", total=card["n"])
-        merge(parts, writer, lambda count: bar.advance(task, count))
+        write_merged(parts, writer, lambda count: bar.advance(task, count))
     click.echo(f"{out}: complete, {card['n']} pairs of {len(parts)} datasets", err=True)

@@ -189,7 +189,7 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     from synthgen.run.estimate import check_free_space, estimate
 
     if missing < MEASURED_FROM:
-        size = dataset.estimated_bytes(job.config, missing)
+        size = dataset.estimated_bytes(job.config.patch_px, job.config.contour_points, missing)
         check_free_space(out, size)
         return f"about {size_text(size)} more"
     try:

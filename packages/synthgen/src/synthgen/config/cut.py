@@ -12,13 +12,14 @@ class CutConfig:
     """How pairs are cut out of annotated images; with the images it decides every byte.
 
     Attributes:
-        seed: Of hypotheses and of the order of images.
+        seed: Of hypotheses.
         patch_px: Side of the patches.
         contour_points: Contour points per silhouette.
         hypotheses_per_pose: Drawn around each annotated pose; without effect on hypotheses from a file.
         shard_size: Pairs in a shard.
-        min_visible: Annotated poses that are visible by less are left out.
-        min_side_px: So are pairs of which one silhouette's box has a longer side of fewer patch pixels.
+        min_visible: Annotated poses that are visible by less are left out, and those whose box the image shows less of.
+        min_area_px: So are pairs of which the convex hull of one silhouette covers fewer pixels of image or patch.
+        images: Most images to cut, evenly spread over those that are there; 0 cuts all.
         window: `diameter` follows the hypothesis' distance and shows every pose as large, for networks whose own window
             does so; `fixed` is the paper's, of one side for all poses of an object.
         scale: Side of a diameter window over the projected diameter. Larger than the network's own, which is cut out
@@ -33,7 +34,8 @@ class CutConfig:
     hypotheses_per_pose: int = 8
     shard_size: int = 64
     min_visible: float = 0.1
-    min_side_px: float = 16.0
+    min_area_px: float = 150.0
+    images: int = 0
     window: Literal["diameter", "fixed"] = "diameter"
     scale: float = 2.0
     padding: float = 0.3
@@ -46,6 +48,7 @@ class CutConfig:
         check("hypotheses_per_pose", self.hypotheses_per_pose, 1, 4096)
         check("shard_size", self.shard_size, 1, 1_000_000)
         check("min_visible", self.min_visible, 0.0, 1.0)
-        check("min_side_px", self.min_side_px, 4.0)
+        check("min_area_px", self.min_area_px, 1.0)
+        check("images", self.images, 0)
         check("scale", self.scale, 1.0, 8.0)
         check("padding", self.padding, 0.0, 4.0)

@@ -97,10 +97,9 @@ def info_text(info: Mapping[str, Any]) -> str:
 
 
 def _source_lines(source: Mapping[str, Any]) -> list[str]:
-    digest = source["hypotheses_sha256"]
-    hypotheses = "drawn" if digest is None else f"of a result file, sha256 {digest[:16]}"
-    lines = [_entry("images", f"{source['images']} of {source['dataset']}, split {source['split']}")]
-    lines += [_entry("hypotheses", hypotheses)]
+    hypotheses = {"drawn": "drawn", "given": "of a result file"}[source["hypotheses"]]
+    of = f"{source['dataset']}, split {source['split']}, sha256 {source['sha256'][:16]}"
+    lines = [_entry("images", f"{source['images']} of {of}"), _entry("hypotheses", hypotheses)]
     return lines + [_entry("left out", f"{count} {why}") for why, count in sorted(source["left_out"].items())]
 
 

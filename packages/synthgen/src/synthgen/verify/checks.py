@@ -3,6 +3,7 @@
 A check measures how far each sample is off; a sample passes at or below the tolerance. NaN never passes.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -231,7 +232,9 @@ def outside(batch: Batch) -> Float[Array, " n"]:
         outer = ~inside_image(_window(values), batch.facts.patch_px, batch.facts.camera)
         if outer.any():
             off[i] = (outer & (batch["scene_mask"][i] & (BIT_VISIBLE | BIT_FOREGROUND) > 0)).sum()
-            far = cv2.erode(outer.astype(np.uint8), _RIM, borderType=cv2.BORDER_REPLICATE) > 0
+            reach_px = max(2, math.ceil(0.5 * batch.facts.patch_px / values[2]) + 1)  # half an image pixel, enlarged
+            rim = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+            far = cv2.erode(outer.astype(np.uint8), rim, borderType=cv2.BORDER_REPLICATE) > 0
             off[i] += (far & batch["scene_rgb"][i].any(axis=-1)).sum()
     return off
 

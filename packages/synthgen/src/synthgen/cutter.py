@@ -1,0 +1,173 @@
+"""Training pairs cut out of annotated images: patches and labels.
+
+Silhouettes, depth and contours are those of the mesh at the annotated pose; what hides it comes from the dataset's
+visible masks, or from the other annotated objects where there are none.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+from posecore import shard
+from posecore.bop import BopDataset
+from posecore.camera import crop_K
+from posecore.contour import contour_mask, distance_transform_px, sample_contour
+from posecore.errors import DatasetError, RenderError
+from posecore.raster import Instance, Rasteriser
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
+from posecore.window import cut, cut_rgb
+
+from synthgen.annotated import Image, Pair, Plan
+from synthgen.config import CutConfig
+from synthgen.draw.streams import Purpose, Subject, stream
+from synthgen.image.region import inside_image
+
+Array = np.ndarray
+_RIM = np.ones((3, 3), np.uint8)
+"""A visible mask may miss the mesh's silhouette by a pixel."""
+
+_BEYOND = np.ones((9, 9), np.uint8)
+"""What a visible mask shows beyond the mesh has the depth of the mesh beside it, so far."""
+
+
+def cut_pairs(
+    dataset: BopDataset,
+    planned: Plan,
+    config: CutConfig,
+    writer: shard.ShardWriter,
+    on_shard: Callable[[int], None] = lambda n: None,
+) -> None:
+    """Cut every pair whose shard is missing or damaged, and commit shard by shard.
+
+    Args:
+        dataset: Images.
+        planned: What.
+        config: The recipe that it was planned with.
+        writer: Where to.
+        on_shard: Told the pairs of every shard, those that were there too.
+
+    Raises:
+        DatasetError: An image or a mask is damaged or of the wrong size.
+        StorageError: The place cannot be written.
+    """
+    there = set(writer.committed()) - set(writer.damaged())
+    seen = sorted({gt.obj_id for image in planned.images for gt in image.annotated})
+    with Rasteriser({obj_id: dataset.mesh(obj_id) for obj_id in seen}) as rasteriser:
+        patches = _Patches(dataset, config, rasteriser)
+        listed = [(image, pair) for image in planned.images for pair in image.pairs]
+        for shard_id in range(shard.n_shards(writer.card)):
+            part = listed[shard_id * config.shard_size : (shard_id + 1) * config.shard_size]
+            if shard_id not in there:
+                rows = [patches.sample(image, pair) for image, pair in part]
+                arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+                writer.commit(writer.encode(shard_id, arrays))
+            on_shard(len(part))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Layers:
+    """One image, with what hides and surrounds its objects.
+
+    Attributes:
+        rgb: The image.
+        depth_m: Camera z of the nearest annotated object where one is seen, 0 elsewhere.
+        hidden: By position in the ground truth, pixels of the object's silhouette that show something else.
+    """
+
+    rgb: Array
+    depth_m: Float[Array, "h w"]
+    hidden: Mapping[int, Bool[Array, "h w"]]
+
+
+class _Patches:
+    """Cuts pairs; keeps the layers of the image that it cut last."""
+
+    def __init__(self, dataset: BopDataset, config: CutConfig, rasteriser: Rasteriser) -> None:
+        self._dataset = dataset
+        self._config = config
+        self._rasteriser = rasteriser
+        self._last: tuple[Image, _Layers] | None = None
+
+    def sample(self, image: Image, pair: Pair) -> dict[str, Array]:
+        """Every field of the shard table."""
+        if self._last is None or self._last[0] is not image:
+            self._last = (image, self._layers(image))
+        layers = self._last[1]
+        p, gt, window, n = self._config.patch_px, pair.gt, pair.window, self._config.contour_points
+        K_crop = crop_K(image.camera.K, window, p)
+        truth = self._rasteriser.render(gt.obj_id, K_crop, gt.T_cam_obj[None], p, p, rgb=False).depth_m[0]
+        guess = self._rasteriser.render(gt.obj_id, K_crop, pair.T_cam_obj_hypothesis[None], p, p)
+        assert guess.rgb is not None
+        depth = guess.depth_m[0]
+        amodal, shape = truth > 0, depth > 0
+        if not amodal.any() or not shape.any():
+            raise RenderError(
+                f"{self._dataset.split_path}: scene {image.scene_id}, image {image.im_id}, object {gt.obj_id}: a "
+                "silhouette covers no pixel of its patch; raise min_area_px, which leaves such pairs out"
+            )
+        hidden = cut(layers.hidden[gt.gt_index].astype(np.uint8), window, p, interpolation="nearest") > 0
+        visible = amodal & inside_image(window, p, image.camera) & ~hidden
+        other_m = cut(layers.depth_m, window, p, interpolation="nearest")
+        scene_depth_m = np.where(visible, truth, np.where(amodal & ~hidden, np.float32(0), other_m))
+        mask = amodal * BIT_OBJECT + visible * BIT_VISIBLE + (scene_depth_m > 0) * BIT_FOREGROUND
+        rng = stream(self._config.seed, Purpose.ANNOTATED, Subject.CONTOUR, image.number, gt.gt_index, pair.number)
+        values = {
+            "scene_rgb": cut_rgb(layers.rgb, window, p),
+            "hypothesis_rgb": guess.rgb[0],
+            "scene_depth_m": scene_depth_m.astype(np.float32),
+            "hypothesis_depth_m": depth,
+            "scene_mask": mask.astype(np.uint8),
+            "scene_contour_cam_m": sample_contour(amodal, truth, K_crop, n, rng),
+            "hypothesis_contour_cam_m": sample_contour(shape, depth, K_crop, n, rng),
+            "scene_distance_px": distance_transform_px(contour_mask(amodal)),
+            "hypothesis_distance_px": distance_transform_px(contour_mask(shape)),
+            "T_cam_obj": gt.T_cam_obj,
+            "T_cam_obj_hypothesis": pair.T_cam_obj_hypothesis,
+            "K": image.camera.K,
+            "K_crop": K_crop,
+            "window_px": window.as_array(),
+            "visible_fraction": np.float32(visible.sum() / amodal.sum()),
+            "obj_id": np.int32(gt.obj_id),
+            "scene_index": np.int64(image.scene_index),
+            "rejected": np.int32(0),
+        }
+        return {name: np.asarray(value) for name, value in values.items()}
+
+    def _layers(self, image: Image) -> _Layers:
+        """Read an image and its masks, and draw its annotated objects."""
+        scene_id, im_id, camera = image.scene_id, image.im_id, image.camera
+        width, height = camera.width_px, camera.height_px
+        drawn = self._rasteriser.render_scene(
+            [Instance(obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj) for gt in image.annotated],
+            camera.K, width, height, rgb=False,
+        )  # fmt: skip
+        wanted = {pair.gt.gt_index for pair in image.pairs}
+        front, hidden = np.zeros((height, width), bool), {}
+        for index, gt in enumerate(image.annotated):
+            found = self._dataset.mask_and_place(scene_id, im_id, gt.gt_index, "mask_visib")
+            seen, place = (drawn.instance == index, "") if found is None else found
+            if seen.shape != front.shape:
+                raise DatasetError(
+                    f"{place}: is {seen.shape[1]} x {seen.shape[0]} pixels, expected {width} x {height} as its image"
+                )
+            front |= seen
+            if gt.gt_index in wanted:
+                whole = self._rasteriser.render(gt.obj_id, camera.K, gt.T_cam_obj[None], width, height, rgb=False)
+                hidden[gt.gt_index] = _hidden(whole.mask[0], seen)
+        depth_m = np.where(drawn.depth_m > 0, drawn.depth_m, cv2.dilate(drawn.depth_m, _BEYOND))
+        rgb = self._dataset.rgb(scene_id, im_id)
+        return _Layers(rgb=rgb, depth_m=np.where(front, depth_m, np.float32(0)), hidden=hidden)
+
+
+def _hidden(whole: Bool[Array, "h w"], seen: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+    """Where a silhouette shows something else, and a pixel beyond its rim there.
+
+    A patch's exact silhouette reaches beyond the image's pixels: its rim is hidden where the nearest pixels are. Lines
+    of one or two pixels are what mask and mesh differ by.
+    """
+    differing = whole & ~seen
+    core = cv2.morphologyEx(differing.astype(np.uint8), cv2.MORPH_OPEN, _RIM)
+    hidden = differing & (cv2.dilate(core, _RIM) > 0)
+    return np.asarray(hidden | ((cv2.dilate(hidden.astype(np.uint8), _RIM) > 0) & ~whole))
