@@ -136,10 +136,9 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
         ),
     ]  # fmt: skip
     refine = f"refinenet refine --dataset {data} --init {init} --keep-failed --threads 1 {chosen.tested}"
-    methods = {
-        "search": "",
-        **{name: f"--checkpoint {folder}/run_{name}/best.safetensors" for name in ("learn", "judge")},
-    }
+    # the judge's best is not the checkpoint whose poses are best from hypotheses that are drawn
+    networks = {"learn": "run_learn/best.safetensors", "judge": "run_judge/last.safetensors"}
+    methods = {"search": "", **{name: f"--checkpoint {folder}/{file}" for name, file in networks.items()}}
     for name, network in methods.items():
         why = f"Real frames: `search`{' with network ' + repr(name) if network else ''}."
         steps.append(refinement(work, f"{refine} --method search {network}", name, why))
@@ -221,6 +220,7 @@ def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> It
         why="Those, cut out of the frames.",
         command=words(
             f"synthgen cut {frames} --hypotheses {folder}/weighed{seed}.csv {PATCHES} --set scale=2.2 {size.smaller} "
+            "--workers 2 "
             f"--out {folder}/mistakes{seed}"
         ),
         leaves=f"mistakes{seed}/manifest.jsonl",

@@ -315,6 +315,22 @@ def test_an_interrupted_run_ends_with_the_same_bytes(images, tmp_path):
         cut_to(tmp_path / "again", images, CutConfig(**SMALL, seed=3))
 
 
+def test_workers_do_not_change_a_byte(images, tmp_path):
+    cut_to(tmp_path / "one", images, CutConfig(**SMALL))
+    planned = annotated.plan(images, CutConfig(**SMALL))
+    assert planned.n > 2 * SMALL["shard_size"]
+    command = ["cut", str(images.root), "--patch-px", "64", "--hypotheses-per-pose", "2", "--workers", "2"]
+    settings = ["contour_points=20", "shard_size=4", "perturbation.max_angle_deg=15"]
+    settings = [word for s in (*settings, "perturbation.max_translation_diameter=0.1") for word in ("--set", s)]
+    result = CliRunner().invoke(main, [*command, *settings, "--out", str(tmp_path / "two"), "--quiet"])
+    assert result.exit_code == 0, result.output
+    one, two = (
+        {path: data for path, data in tree(tmp_path / name).items() if not path.startswith("models/")}
+        for name in ("one", "two")
+    )
+    assert one == two
+
+
 def test_the_seed_decides_hypotheses(images):
     first, again, other = (annotated.plan(images, CutConfig(**SMALL, seed=seed)) for seed in (1, 1, 2))
 

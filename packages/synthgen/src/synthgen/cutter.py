@@ -4,8 +4,15 @@ Silhouettes, depth and contours are those of the mesh at the annotated pose; wha
 visible masks, or from the other annotated objects where there are none.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +30,8 @@ from synthgen.annotated import Image, Pair, Plan
 from synthgen.config import CutConfig
 from synthgen.draw.streams import Purpose, Subject, stream
 from synthgen.image.region import inside_image
+from synthgen.pair import limit_threads
+from synthgen.run.processes import die_with_parent
 
 Array = np.ndarray
 _RIM = np.ones((3, 3), np.uint8)
@@ -38,6 +47,8 @@ def cut_pairs(
     config: CutConfig,
     writer: shard.ShardWriter,
     on_shard: Callable[[int], None] = lambda n: None,
+    *,
+    workers: int = 1,
 ) -> None:
     """Cut every pair whose shard is missing or damaged, and commit shard by shard.
 
@@ -47,23 +58,118 @@ def cut_pairs(
         config: The recipe that it was planned with.
         writer: Where to.
         on_shard: Told the pairs of every shard, those that were there too.
+        workers: Processes. The bytes do not depend on it.
 
     Raises:
         DatasetError: An image or a mask is damaged or of the wrong size.
+        RenderError: No EGL device, a silhouette without a pixel, or a worker process died.
         StorageError: The place cannot be written.
     """
     there = set(writer.committed()) - set(writer.damaged())
+    for shard_id in sorted(there):
+        on_shard(shard.samples_in(writer.card, shard_id))
     seen = sorted({gt.obj_id for image in planned.images for gt in image.annotated})
-    with Rasteriser({obj_id: dataset.mesh(obj_id) for obj_id in seen}) as rasteriser:
-        patches = _Patches(dataset, config, rasteriser)
-        listed = [(image, pair) for image in planned.images for pair in image.pairs]
-        for shard_id in range(shard.n_shards(writer.card)):
-            part = listed[shard_id * config.shard_size : (shard_id + 1) * config.shard_size]
-            if shard_id not in there:
-                rows = [patches.sample(image, pair) for image, pair in part]
-                arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
-                writer.commit(writer.encode(shard_id, arrays))
-            on_shard(len(part))
+    source = _Source(dataset=dataset, obj_ids=tuple(seen), config=config, card=writer.card)
+    tasks = [(i, part) for i, part in enumerate(_parts(planned, config.shard_size)) if i not in there]
+    with _mapped(source, tasks, workers) as found:
+        for encoded in found:
+            writer.commit(encoded)
+            on_shard(encoded.line["n"])
+
+
+def _parts(planned: Plan, shard_size: int) -> list[list[Image]]:
+    """Images of every shard, with the pairs that fall into it."""
+    parts: list[list[Image]] = []
+    room = 0
+    for image in planned.images:
+        first = 0
+        while first < len(image.pairs):
+            if room == 0:
+                parts.append([])
+                room = shard_size
+            pairs = image.pairs[first : first + room]
+            parts[-1].append(replace(image, pairs=pairs))
+            first, room = first + len(pairs), room - len(pairs)
+    return parts
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Source:
+    """What a process needs to cut any shard."""
+
+    dataset: BopDataset
+    obj_ids: tuple[int, ...]
+    config: CutConfig
+    card: Mapping[str, Any]
+
+
+class _ShardCutter:
+    """Cuts shards, in the thread that made it."""
+
+    def __init__(self, source: _Source) -> None:
+        self._card = source.card
+        self._rasteriser = Rasteriser({obj_id: source.dataset.mesh(obj_id) for obj_id in source.obj_ids})
+        self._patches = _Patches(source.dataset, source.config, self._rasteriser)
+
+    def cut(self, shard_id: int, images: Sequence[Image]) -> shard.Encoded:
+        """One shard, encoded."""
+        rows = [self._patches.sample(image, pair) for image in images for pair in image.pairs]
+        return shard.encode(self._card, shard_id, {name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+    def close(self) -> None:
+        """Free what was uploaded."""
+        self._rasteriser.close()
+
+
+_worker: list[_ShardCutter] = []
+
+
+def _start_worker(source: _Source) -> None:
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends ctrl-C to all; the parent ends the work
+    limit_threads(1)
+    _worker[:] = [_ShardCutter(source)]
+
+
+def _in_worker(task: tuple[int, Sequence[Image]]) -> shard.Encoded:
+    return _worker[0].cut(*task)
+
+
+@contextmanager
+def _mapped(
+    source: _Source, tasks: Sequence[tuple[int, Sequence[Image]]], workers: int
+) -> Iterator[Iterator[shard.Encoded]]:
+    """Shards in the order of the tasks, from this process or from a pool of spawned ones."""
+    workers = min(workers, len(tasks))
+    if workers <= 1:
+        limit_threads(1)
+        cutter = _ShardCutter(source)
+        try:
+            yield (cutter.cut(*task) for task in tasks)
+        finally:
+            cutter.close()
+        return
+    spawn = multiprocessing.get_context("spawn")  # a forked GL context is undefined
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(source,)) as pool:
+        try:
+            yield _few_ahead(pool, tasks, 2 * workers)
+        except BrokenProcessPool as error:
+            raise RenderError("a process that cuts died; start again, which goes on, with fewer --workers") from error
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _few_ahead(
+    pool: ProcessPoolExecutor, tasks: Sequence[tuple[int, Sequence[Image]]], ahead: int
+) -> Iterator[shard.Encoded]:
+    """Results in order; no more are made than are soon written, for shards that wait take memory."""
+    waiting: deque[Future[shard.Encoded]] = deque()
+    for task in tasks:
+        waiting.append(pool.submit(_in_worker, task))
+        if len(waiting) >= ahead:
+            yield waiting.popleft().result()
+    while waiting:
+        yield waiting.popleft().result()
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

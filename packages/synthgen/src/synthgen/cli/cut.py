@@ -35,6 +35,7 @@ from synthgen.cli.console import progress_bar, stoppable
     help="Change one configuration key: seed, patch_px, contour_points, hypotheses_per_pose, shard_size, min_visible, "
     "min_area_px, images, window, scale, padding, perturbation.max_angle_deg, ... Repeatable; last wins.",
 )
+@click.option("--workers", type=click.IntRange(1), default=1, help="Processes; the bytes do not depend on it.")
 @click.option("--quiet", is_flag=True, help="No progress bar.")
 def cut(
     dataset: Path,
@@ -43,6 +44,7 @@ def cut(
     sensor: str | None,
     hypotheses: Path | None,
     overrides: tuple[str, ...],
+    workers: int,
     quiet: bool,
     **values: int | None,
 ) -> None:
@@ -91,5 +93,5 @@ def cut(
             writer.add_file(key, data)
         with progress_bar(quiet) as bar:
             task = bar.add_task("pairs", total=planned.n)
-            cut_pairs(images, planned, config, writer, lambda count: bar.advance(task, count))
+            cut_pairs(images, planned, config, writer, lambda count: bar.advance(task, count), workers=workers)
     click.echo(f"{out}: complete, {planned.n} pairs of {len(planned.images)} images", err=True)
