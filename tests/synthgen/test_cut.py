@@ -102,6 +102,20 @@ def test_windows_follow_the_distance_or_not(images):
     assert len(sides) == len({obj_id for obj_id, _ in sides}) == 2
 
 
+def test_a_fixed_window_is_as_large_as_the_nearest_pose_may_need(images, tmp_path):
+    """Whatever way the object is turned there; so nothing larger is left out, and it is not much too large."""
+    there = poses(images)
+    write_results(tmp_path / "truth.csv", [estimate(s, i, gt.obj_id, gt.T_cam_obj) for s, i, gt in there])
+    config = CutConfig(**SMALL, window="fixed", padding=0.0)
+    planned = annotated.plan(images, config, tmp_path / "truth.csv")
+    assert planned.n == len(there)
+    for obj_id, side_px in planned.windows_px.items():
+        mesh = planned.meshes[obj_id]
+        z = min(annotated.centre_m(gt.T_cam_obj, mesh)[2] for *_, gt in there if gt.obj_id == obj_id)
+        across_px = CAMERA["fy"] * mesh.diameter_m / z
+        assert 0.8 < side_px / across_px < 1.3
+
+
 def test_the_scene_patch_is_the_image_there(images, tmp_path):
     """Every pixel of a patch is the image's where the window says that its centre lies."""
     planned = cut_to(tmp_path / "shards", images, CutConfig(**{**SMALL, "patch_px": 128}))
