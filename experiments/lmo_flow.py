@@ -19,6 +19,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import ROOT, Step, quoted, words
 from experiments.common import ON_GPUS, Experiment, Inputs, main, refinement, report
+from experiments.lmo_add import EXPERIMENT as PROTOCOL
 from experiments.lmo_add import start_poses_of
 
 SETS = (17, 18, 19)
@@ -230,11 +231,7 @@ def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> It
 EXPERIMENT = Experiment(
     name=Path(__file__).stem,
     doc=__doc__,
-    paper={
-        "ADD at 0.1 diameter": "6.2 to 27.5 %",
-        "rotation error": "34.42 to 24.36 deg",
-        "x, y, z errors": "13.7, 13.4, 77.5 to 8.5, 9.0, 49.1 mm",
-    },
+    paper=PROTOCOL.paper,
     minutes={
         "smoke": "about ten minutes on two CPU cores",
         "small": "about five hours on two CPU cores",
