@@ -216,17 +216,12 @@ def plan(dataset: BopDataset, config: CutConfig, hypotheses: str | Path | None =
         DatasetError: There is no ground truth, images are of several sizes, or nothing is left to cut.
         ResultFileError: The result file is broken, or of other images.
     """
-    digest = hashlib.sha256()
     given = None if hypotheses is None else _hypotheses_by_image(dataset, hypotheses)
-    images = [
-        one
-        for one in _images(dataset, None if given is None else set(given), config.images)
-        if given is None or (one.scene_id, one.im_id) in given
-    ]
+    images = _images(dataset, None if given is None else set(given), config.images)
     _require_one_size(dataset, images, one_focal_length=config.window == "fixed")
     meshes = {i: dataset.mesh(i) for i in sorted({gt.obj_id for image in images for gt in image.annotated})}
     picker = _Picker(config, meshes, images)
-    planned = []
+    planned, digest = [], hashlib.sha256()
     for image in images:
         there = None if given is None else given[image.scene_id, image.im_id]
         pairs = tuple(picker.pairs(image, there))

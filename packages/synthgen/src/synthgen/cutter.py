@@ -4,12 +4,9 @@ Silhouettes, depth and contours are those of the mesh at the annotated pose; wha
 visible masks, or from the other annotated objects where there are none.
 """
 
-import multiprocessing
-import signal
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -31,7 +28,7 @@ from synthgen.config import CutConfig
 from synthgen.draw.streams import Purpose, Subject, stream
 from synthgen.image.region import inside_image
 from synthgen.pair import limit_threads
-from synthgen.run.processes import die_with_parent
+from synthgen.run.processes import behave_as_worker, spawned
 
 Array = np.ndarray
 _RIM = np.ones((3, 3), np.uint8)
@@ -125,8 +122,7 @@ _worker: list[_ShardCutter] = []
 
 
 def _start_worker(source: _Source) -> None:
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends ctrl-C to all; the parent ends the work
+    behave_as_worker()
     limit_threads(1)
     _worker[:] = [_ShardCutter(source)]
 
@@ -149,14 +145,9 @@ def _mapped(
         finally:
             cutter.close()
         return
-    spawn = multiprocessing.get_context("spawn")  # a forked GL context is undefined
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(source,)) as pool:
-        try:
-            yield _few_ahead(pool, tasks, 2 * workers)
-        except BrokenProcessPool as error:
-            raise RenderError("a process that cuts died; start again, which goes on, with fewer --workers") from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+    died = "a process that cuts died; start again, which goes on, with fewer --workers"
+    with spawned(workers, _start_worker, (source,), died) as pool:
+        yield _few_ahead(pool, tasks, 2 * workers)
 
 
 def _few_ahead(

@@ -6,9 +6,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+from posecore.errors import RenderError
 
 _PR_SET_PDEATHSIG = 1
 
@@ -49,3 +54,35 @@ def interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def behave_as_worker() -> None:
+    """What a process of `spawned` does first: it ends with its parent, and leaves ctrl-C to it."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends ctrl-C to all; the parent ends the work
+
+
+@contextmanager
+def spawned(
+    workers: int, start: Callable[..., None], arguments: tuple[Any, ...], died: str
+) -> Iterator[ProcessPoolExecutor]:
+    """A pool of processes, spawned because a forked GL context is undefined. What has not begun at an error is dropped.
+
+    Args:
+        workers: How many.
+        start: Called first in each; it begins with `behave_as_worker`.
+        arguments: Its arguments.
+        died: What to say when one dies.
+
+    Raises:
+        RenderError: One died.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=start, initargs=arguments) as pool:
+        try:
+            yield pool
+        except BrokenProcessPool as error:
+            raise RenderError(died) from error
+        except BaseException:
+            pool.shutdown(cancel_futures=True)  # else it would go on to the last task
+            raise

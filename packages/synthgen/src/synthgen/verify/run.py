@@ -2,22 +2,18 @@
 
 import hashlib
 import json
-import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from posecore.errors import RenderError, ShardError, StorageError
+from posecore.errors import ShardError, StorageError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, n_shards
 from posecore.shard.group import metadata
 
 from synthgen.pair import limit_threads
-from synthgen.run.processes import die_with_parent
+from synthgen.run.processes import behave_as_worker, spawned
 from synthgen.verify.checks import CHECKS, Check
 from synthgen.verify.coverage import Coverage, coverage_of, joined
 from synthgen.verify.facts import Batch, Facts, load_facts, manifest_lines
@@ -158,8 +154,7 @@ _worker: list[ShardVerifier] = []
 
 
 def _start_worker(url: str) -> None:
-    die_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends ctrl-C to all; the parent ends the work
+    behave_as_worker()
     limit_threads(1)
     _worker[:] = [ShardVerifier(url)]
 
@@ -180,17 +175,9 @@ def _mapped(
         finally:
             verifier.close()
         return
-    spawn = multiprocessing.get_context("spawn")  # a forked GL context is undefined
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=_start_worker, initargs=(url,)) as pool:
-        try:
-            yield pool.map(_in_worker, tasks)
-        except BrokenProcessPool as error:
-            raise RenderError(
-                f"{url}: a worker process died while it verified; start again with fewer --workers"
-            ) from error
-        except BaseException:
-            pool.shutdown(cancel_futures=True)  # else it would go on to the last shard
-            raise
+    died = f"{url}: a worker process died while it verified; start again with fewer --workers"
+    with spawned(workers, _start_worker, (url,), died) as pool:
+        yield pool.map(_in_worker, tasks)
 
 
 def _complete(reader: ShardReader, allow_incomplete: bool) -> Finding:
