@@ -3,7 +3,6 @@
 import json
 import multiprocessing
 import os
-import signal
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -314,8 +313,7 @@ class _Worker:
 
 
 def _start(job: FrameJob) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    processes.die_with_parent()
+    processes.behave_as_worker()
     processes.forget_blenders_paths()
     _Worker.job = job
 

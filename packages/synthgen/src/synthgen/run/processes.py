@@ -57,7 +57,7 @@ def interrupts_ignored() -> Iterator[None]:
 
 
 def behave_as_worker() -> None:
-    """What a process of `spawned` does first: it ends with its parent, and leaves ctrl-C to it."""
+    """What a worker process does first: it ends with its parent, and leaves ctrl-C to it."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends ctrl-C to all; the parent ends the work
 
