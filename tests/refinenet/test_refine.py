@@ -458,9 +458,17 @@ def test_refine_command(cli, bop, trained, tmp_path):
     result = cli("refine", *arguments[:-2], "--iterations", 1, "--keep-failed")
     assert "1 failed (start poses kept)" in result.stdout
     kept, sidecar = read_results(out), read_sidecar(out)
+    assert sidecar["settings"]["min_confidence"] == 0
     assert (len(kept), sidecar["start_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
     assert kept[2].score == 0
     np.testing.assert_allclose(kept[2].T_cam_obj, starts[2].T_cam_obj)
+    between = (kept[0].score + kept[1].score) / 2
+    result = cli("refine", *arguments[:-2], "--iterations", 1, "--min-confidence", between)
+    assert "2 failed" in result.stdout
+    doubted, sidecar = min(kept[:2], key=lambda estimate: estimate.score), read_sidecar(out)
+    why = f"after 1 updates its confidence is {doubted.score:.3f}, {between:g} needed"
+    assert sidecar["failures"][str(doubted.line)] == why
+    assert sidecar["start_lines"] == [{2: 3, 3: 2}[doubted.line]]
 
 
 def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):

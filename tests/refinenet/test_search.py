@@ -118,7 +118,7 @@ def test_what_a_network_finds_is_taken_where_it_agrees_better(tug, seen, monkeyp
     wrong = se3.perturb(truth, np.deg2rad(30), 0.1 * tug.diameter_m, np.random.default_rng(0))
     results = {}
     for name, network in (("none", None), ("knows", Given(wrong, None, truth)), ("errs", Given(wrong, None))):
-        refiner = make_baseline("search", {1: tug}, 2, network)
+        refiner = make_baseline("search", {1: tug}, 2, network=network)
         (results[name],) = refiner.refine_batch(frame, [request])
         if network is not None:
             assert refiner.settings["network"] == {"preset": "given"}
@@ -160,8 +160,8 @@ def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monke
     frame, truth, _, _ = seen
     request = Request(obj_id=1, T_cam_obj=far_start(truth, 0))
 
-    def found(network):
-        refiner = make_baseline("search", {1: tug}, 2, network)
+    def found(network, min_confidence=None):
+        refiner = make_baseline("search", {1: tug}, 2, network=network, min_confidence=min_confidence)
         (result,) = refiner.refine_batch(frame, [request])
         refiner.close()
         return result
@@ -176,11 +176,10 @@ def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monke
     np.testing.assert_array_equal(against.T_cam_obj, other)
     assert 0.5 < against.confidence < agreed.confidence
     nowhere = found(Judge(np.zeros((4, 4))))
-    monkeypatch.setattr(search_module, "MIN_FIT", 0.0)
-    moved = found(Mover(far_start(truth, 3)))
+    moved = found(Mover(far_start(truth, 3)), min_confidence=0.0)
     np.testing.assert_array_equal(moved.T_cam_obj, far_start(truth, 3))
     assert moved.confidence < plain.confidence
-    without = found(Mover(None))
+    without = found(Mover(None), min_confidence=0.0)
     np.testing.assert_array_equal(without.T_cam_obj, plain.T_cam_obj)
     assert without.confidence == pytest.approx(plain.confidence / 2)
     assert nowhere.failed
@@ -205,6 +204,11 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
     assert sidecar["settings"]["network"]["preset"] == "compact"
     (found,) = read_results(tmp_path / "x.csv")
     assert distances(tug, truth, found.T_cam_obj) < 0.1
+    result = cli("refine", "--method", "search", *rest, "--iterations", 1, "--min-confidence", 0.99)
+    assert "gradients agree with the image's by 0." in result.stderr
+    assert "at most, 0.99 needed" in result.stderr
+    assert (len(read_results(tmp_path / "x.csv")), read_sidecar(tmp_path / "x.csv")["failed_lines"]) == (0, [2])
+    assert read_sidecar(tmp_path / "x.csv")["settings"]["min_confidence"] == 0.99
     candidates = ["--candidates", tmp_path / "all.csv", "--keep-failed"]
     assert cli("refine", "--method", "search", *candidates, *rest, "--iterations", 1).exit_code == 0
     weighed, (kept,) = read_results(tmp_path / "all.csv"), read_results(tmp_path / "x.csv")
@@ -218,6 +222,7 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
         ("search", ["--candidates", tmp_path / "x.csv"], "--candidates and --out are both"),
         ("region", network, "--method region takes no --checkpoint"),
         ("search", ["--hypotheses", 4], "--hypotheses is for --method network, search does without"),
+        ("region", ["--min-confidence", 0.2], "for --method network and search, region tells no confidence"),
     ):
         result = cli("refine", "--method", method, *more, *rest)
         assert result.exit_code == 2

@@ -128,13 +128,29 @@ class NetworkRefiner(PoseRefiner, Protocol):
 
 WITH_NETWORK = ("search",)
 """Those that a network makes more exact, where there is one."""
+WITH_CONFIDENCE = (NETWORK, *WITH_NETWORK)
+"""Those that tell how confident they are of a pose."""
 
 
 def make_baseline(
-    name: str, meshes: Mapping[int, Mesh], iterations: int, network: NetworkRefiner | None = None
+    name: str,
+    meshes: Mapping[int, Mesh],
+    iterations: int,
+    *,
+    network: NetworkRefiner | None = None,
+    min_confidence: float | None = None,
 ) -> PoseRefiner:
-    """A method of `BASELINES`; those of `WITH_NETWORK` also with a network, which is closed with it."""
+    """A method of `BASELINES`.
+
+    Args:
+        name: Of the method.
+        meshes: Objects by id.
+        iterations: Most updates of a pose.
+        network: For those of `WITH_NETWORK`, closed with the method.
+        min_confidence: For those of `WITH_CONFIDENCE`, the least that is no failure; the method's own where it is None.
+    """
     module, _, made = BASELINES[name].partition(":")
-    more = {} if network is None else {"network": network}
+    given = {"network": network, "min_confidence": min_confidence}
+    more = {key: value for key, value in given.items() if value is not None}
     refiner: PoseRefiner = getattr(importlib.import_module(module), made)(meshes, iterations=iterations, **more)
     return refiner

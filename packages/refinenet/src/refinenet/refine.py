@@ -58,6 +58,7 @@ class Refiner:
         device: `auto`, `cpu` or `cuda`.
         batch: Largest number of poses in one forward pass; halved, with a warning, where the GPU's memory is too small.
         allow_other_mesh: Take a mesh of the trained object's size that is not the trained one.
+        min_confidence: A refined pose that is less confident failed.
 
     Attributes:
         checkpoint: Checkpoint.
@@ -83,12 +84,14 @@ class Refiner:
         device: str = "auto",
         batch: int = 64,
         allow_other_mesh: bool = False,
+        min_confidence: float = 0.0,
     ) -> None:
         for obj_id, mesh in sorted(meshes.items()):
             require_trained(loaded, obj_id, mesh, allow_other_mesh=allow_other_mesh)
         self.checkpoint = loaded
         self.meshes = dict(meshes)
         self._iterations = iterations
+        self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
         self._sees_depth = loaded.provenance.config.network.sees_depth
@@ -135,6 +138,7 @@ class Refiner:
             "stop_angle_deg": STOP_ANGLE_DEG,
             "stop_distance_mm": 1e3 * STOP_DISTANCE_M,
             "confidence": self.scorer,
+            "min_confidence": self._min_confidence,
         }
 
     def refine(
@@ -169,7 +173,9 @@ class Refiner:
         # The last update is followed by no render of its own, so where it led is looked at here.
         left = np.array([i for i, why in enumerate(batch.failures) if why is None], np.int64)
         confidence, failures = self._judge(frame, batch.T[left], batch.obj_id[left], scorer=None)
-        for row, why in zip(left, failures, strict=True):
+        for row, why, found in zip(left, failures, confidence, strict=True):
+            if why is None and found < self._min_confidence:
+                why = f"its confidence is {found:.3f}, {self._min_confidence:g} needed"
             batch.failures[row] = why and f"after {batch.iterations[row]} updates {why}"
         of_row = dict(zip(left.tolist(), confidence.tolist(), strict=True))
         return [

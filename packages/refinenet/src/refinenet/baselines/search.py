@@ -68,18 +68,27 @@ class GradientSearch(Baseline):
         iterations: Of the edge ICP in the end.
         network: Refines what edge ICP makes of each candidate; closed with this. One that tells closeness is asked
             which of them is right as well, beside the agreement of gradients.
+        min_confidence: A pose that is less confident failed; `MIN_AGREEMENT` by default, `MIN_FIT` with a network that
+            tells closeness.
     """
 
     name = "search"
 
     def __init__(
-        self, meshes: Mapping[int, Mesh], *, iterations: int = 5, network: NetworkRefiner | None = None
+        self,
+        meshes: Mapping[int, Mesh],
+        *,
+        iterations: int = 5,
+        network: NetworkRefiner | None = None,
+        min_confidence: float | None = None,
     ) -> None:
         super().__init__(meshes, iterations=iterations)
         self._network = network
         if network is not None:
             self.name = f"{self.name} with {network.name}"
         self._judged = network is not None and network.tells_closeness
+        own = MIN_FIT if self._judged else MIN_AGREEMENT
+        self._min_confidence = own if min_confidence is None else min_confidence
         self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
         self._quick = Rasteriser(self._simple)
         self._views: dict[int, SparseViews] = {}
@@ -87,7 +96,8 @@ class GradientSearch(Baseline):
     @property
     def settings(self) -> dict[str, Any]:
         """For the sidecar."""
-        return super().settings | ({} if self._network is None else {"network": self._network.settings})
+        own = super().settings | {"min_confidence": self._min_confidence}
+        return own | ({} if self._network is None else {"network": self._network.settings})
 
     def close(self) -> None:
         """Free what the renderers hold, and close the network."""
@@ -112,12 +122,10 @@ class GradientSearch(Baseline):
         chosen = tried[int(np.argmax(scores))].T_cam_obj
         (best,) = self._by_network(frame, [self._followed(frame, chosen, target, self.iterations)], target)
         done = 1 + len(ROUNDS) + len(POLISH) + sum(one.iterations for one in (*tried, best))
-        what, needed = (
-            ("its fit is", MIN_FIT) if self._judged else ("gradients agree with the image's by", MIN_AGREEMENT)
-        )
         weighed = (*tried, best)
-        if _confidence(best) < needed:
-            why = f"{what} {_confidence(best):.3f} at most, {needed} needed"
+        if _confidence(best) < self._min_confidence:
+            what = "its fit is" if self._judged else "gradients agree with the image's by"
+            why = f"{what} {_confidence(best):.3f} at most, {self._min_confidence:g} needed"
             return replace(failed(T_cam_obj, done, why), tried=weighed)
         return replace(best, iterations=done, tried=weighed)
 

@@ -20,7 +20,7 @@ from refinenet.cli.options import (
     threads_option,
     verbose_option,
 )
-from refinenet.methods import NETWORK, WITH_NETWORK, make_baseline
+from refinenet.methods import NETWORK, WITH_CONFIDENCE, WITH_NETWORK, make_baseline
 
 if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
@@ -48,6 +48,11 @@ SHOWN_FAILURES = 5
 )  # fmt: skip
 @click.option("--seed", type=click.IntRange(0), default=0, help="Of the hypotheses.")
 @click.option("--object", "objects", type=int, multiple=True, help="Refine only this object's poses. Repeatable. [all]")
+@click.option(
+    "--min-confidence",
+    type=click.FloatRange(0, 1),
+    help="A pose that is less confident fails. [network: 0, search: 0.4, with a network that tells closeness: 0.5]",
+)
 @click.option("--keep-failed", is_flag=True, help="Write the start pose of one that fails, with score 0. [left out]")
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
 @click.option("--overlay", type=FILE, metavar="DIR", help="Draw start (red) and refined (green) contours here.")
@@ -73,6 +78,7 @@ def refine(
     scorer: "PoolScorer",
     seed: int,
     objects: tuple[int, ...],
+    min_confidence: float | None,
     keep_failed: bool,
     name: str | None,
     overlay: Path | None,
@@ -101,6 +107,10 @@ def refine(
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
+    if min_confidence is not None and method not in WITH_CONFIDENCE:
+        raise click.UsageError(
+            f"--min-confidence is for --method {' and '.join(WITH_CONFIDENCE)}, {method} tells no confidence"
+        )
     if candidates is not None and method not in WITH_NETWORK:
         raise click.UsageError(f"--candidates is for --method {WITH_NETWORK[0]}, {method} follows one pose")
     if candidates is not None and candidates.resolve() == out.resolve():
@@ -125,10 +135,11 @@ def refine(
     network: Refiner | None = None
     if loaded is not None:
         network = Refiner(
-            loaded, meshes, iterations=iterations, device=device, batch=batch, allow_other_mesh=allow_other_mesh
-        )
+            loaded, meshes, iterations=iterations, device=device, batch=batch, allow_other_mesh=allow_other_mesh,
+            min_confidence=(min_confidence or 0.0) if method == NETWORK else 0.0,
+        )  # fmt: skip
     if network is None or method != NETWORK:
-        refiner: PoseRefiner = make_baseline(method, meshes, iterations, network)
+        refiner: PoseRefiner = make_baseline(method, meshes, iterations, network=network, min_confidence=min_confidence)
     else:
         refiner = network if hypotheses == 1 else PooledRefiner(network, hypotheses, scorer, seed)
     try:
