@@ -1,6 +1,7 @@
 """The GL rasteriser against its numpy twin, known corners, and its own repetition."""
 
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -91,6 +92,18 @@ def test_two_rasterisers_in_one_process_do_not_disturb_each_other(rasteriser: Ra
         with Rasteriser({1: RING}) as other:
             assert other.render(1, K, T, 140, 100).mask.any()
     np.testing.assert_array_equal(rasteriser.render(1, K, T, 140, 100).depth_m, before)
+
+
+def test_other_threads_draw_the_same(rasteriser: Rasteriser) -> None:
+    T = poses(8)
+    here = rasteriser.render(2, K, T, 140, 100)
+    with ThreadPoolExecutor(4) as pool:
+        others = list(pool.map(lambda _: rasteriser.render(2, K, T, 140, 100), range(12)))
+        with pool.submit(Rasteriser, {2: RING}).result() as made_there:
+            others.append(made_there.render(2, K, T, 140, 100))
+    for there in others:
+        np.testing.assert_array_equal(there.rgb, here.rgb)
+        np.testing.assert_array_equal(there.depth_m, here.depth_m)
 
 
 def test_scene_keeps_the_nearest_instance(rasteriser: Rasteriser) -> None:

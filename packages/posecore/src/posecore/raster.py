@@ -6,10 +6,12 @@ engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mas
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import wraps
 from types import TracebackType
-from typing import Any
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import moderngl
 import numpy as np
@@ -19,6 +21,7 @@ from posecore.errors import RenderError
 from posecore.mesh import Mesh
 
 Array = np.ndarray
+P, R = ParamSpec("P"), TypeVar("R")
 MAX_LIGHTS = 8
 ATLAS_SIDE_PX = 2048  # tiles of one batch share a framebuffer of at most this side: one read-back for all of them
 
@@ -160,12 +163,39 @@ class SceneLayers:
 _threads = threading.local()
 
 
-def _thread_context() -> Any:
-    """The GL context of this thread, made once and never released.
+class _Device:
+    """A GL context, and the lock of who uses it: it is current in one thread, and only while it draws."""
+
+    def __init__(self, context: Any) -> None:
+        self.context = context
+        self._lock = threading.RLock()
+
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        """Make it this thread's; Blender, in the same process, makes a context of its own the current one."""
+        with self._lock, self.context:
+            yield
+
+
+def _drawing(
+    method: "Callable[Concatenate[Rasteriser, P], R]",
+) -> "Callable[Concatenate[Rasteriser, P], R]":
+    """A method that runs with the context current."""
+
+    @wraps(method)
+    def wrapped(self: "Rasteriser", *args: P.args, **settings: P.kwargs) -> R:
+        with self._device.current():
+            return method(self, *args, **settings)
+
+    return wrapped
+
+
+def _thread_device() -> _Device:
+    """The GL context that rasterisers made in this thread share, made once and never released.
 
     Releasing one ends EGL for the whole process, and contexts made after that draw nothing, without an error.
     """
-    if not hasattr(_threads, "context"):
+    if not hasattr(_threads, "device"):
         settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
         try:
             context: Any = moderngl.create_context(**settings)
@@ -178,12 +208,13 @@ def _thread_context() -> Any:
         context.gc_mode = "auto"
         context.enable(moderngl.DEPTH_TEST)
         context.front_face = "cw"  # image rows run downwards, which turns counter-clockwise faces around
-        _threads.context = context
-    return _threads.context
+        _threads.device = _Device(context)
+    device: _Device = _threads.device
+    return device
 
 
 class Rasteriser:
-    """Draws meshes at poses. One per process and thread; a context manager.
+    """Draws meshes at poses; a context manager. One per process; any thread may use it, one at a time.
 
     Args:
         meshes: Meshes by object id; uploaded at their first use.
@@ -194,15 +225,16 @@ class Rasteriser:
 
     def __init__(self, meshes: Mapping[int, Mesh]) -> None:
         self._meshes = dict(meshes)
-        self._context = _thread_context()
-        self._context.__enter__()  # Blender, in the same process, makes a context of its own the current one
-        self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
-        self._depth_program: Any = self._context.program(
-            vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=DEPTH_FRAGMENT_SHADER
-        )
+        self._device = _thread_device()
+        self._context = self._device.context
+        with self._device.current():
+            self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
+            self._depth_program: Any = self._context.program(
+                vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=DEPTH_FRAGMENT_SHADER
+            )
+            self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
         self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
         self._textures: dict[int, moderngl.Texture] = {}
-        self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
         self._targets: dict[tuple[int, int, bool], moderngl.Framebuffer] = {}
 
     def __enter__(self) -> "Rasteriser":
@@ -216,28 +248,32 @@ class Rasteriser:
     @property
     def device(self) -> str:
         """The GL renderer's own name."""
-        return str(self._context.info["GL_RENDERER"])
+        with self._device.current():
+            return str(self._context.info["GL_RENDERER"])
 
     @property
     def is_software(self) -> bool:
         """Whether the processor draws, not a GPU."""
         return any(name in self.device.lower() for name in ("llvmpipe", "softpipe", "swrast"))
 
+    @_drawing
     def add(self, obj_id: int, mesh: Mesh) -> None:
         """Add a mesh, or replace the one of this id."""
-        self._context.__enter__()
         self._release(obj_id)
         self._meshes[obj_id] = mesh
 
+    @_drawing
     def close(self) -> None:
-        """Free everything that was uploaded."""
-        self._context.__enter__()
+        """Free everything; nothing can be drawn after that."""
+        for held in (self._program, self._depth_program, self._blank):
+            held.release()
         for obj_id in list(self._arrays):
             self._release(obj_id)
         for target in self._targets.values():
             self._free(target)
         self._targets.clear()
 
+    @_drawing
     def render(
         self,
         obj_id: int,
@@ -260,7 +296,6 @@ class Rasteriser:
             rgb: Whether colours are read back.
             shading: Lights.
         """
-        self._context.__enter__()
         n = len(T_cam_obj)
         K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
@@ -286,6 +321,7 @@ class Rasteriser:
                 colours[start:stop] = _tiles(self._read_rgb(target, size), used_rows, used_columns)[: stop - start]
         return Layers(rgb=colours, depth_m=depth)
 
+    @_drawing
     def render_scene(
         self,
         instances: Sequence[Instance],
@@ -297,7 +333,6 @@ class Rasteriser:
         shading: Shading = HEADLIGHT,
     ) -> SceneLayers:
         """Draw several objects into one image."""
-        self._context.__enter__()
         self._set_shading(shading)
         target = self._begin(width_px, height_px, rgb=True)
         target.viewport = (0, 0, width_px, height_px)

@@ -29,7 +29,8 @@ def gradient_agreement(
     An edge pixel of the render, silhouette included, counts with the cosine of twice the angle between both gradients
     where the image has an edge too, and with 0 where it has none: equal and opposite gradients count 1, perpendicular
     ones -1, and orientations that have nothing to do with each other cancel. (The mean of the absolute cosine itself,
-    as in LINE-2D, would be 0.64 for those.) A negative mean, and one over no pixel inside the image, is 0.
+    as in LINE-2D, would be 0.64 for those.) A negative mean is 0. Where more than half of the silhouette lies outside of
+    the image the mean is over few pixels and says little, so it counts the less, down to 0 where nothing lies inside.
 
     Args:
         scene_rgb: Patches of the image.
@@ -43,7 +44,8 @@ def gradient_agreement(
     cosine = (render * scene).sum(axis=-1)
     agreement = (2 * cosine**2 - 1) * (edges & (scene_strength > SCENE_EDGE))
     mean = agreement.sum(axis=(1, 2)) / np.maximum(edges.sum(axis=(1, 2)), 1)
-    return np.clip(mean, 0.0, 1.0).astype(np.float64)
+    seen = (mask & inside).sum(axis=(1, 2)) / np.maximum(mask.sum(axis=(1, 2)), 1)
+    return np.clip(mean, 0.0, 1.0) * np.minimum(2.0 * seen, 1.0)
 
 
 def render_gradients(

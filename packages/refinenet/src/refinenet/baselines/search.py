@@ -133,11 +133,12 @@ class GradientSearch(Baseline):
         """A pose, or what edge ICP makes of it where that agrees better."""
         by_edges = refine_by_edges(frame.image, frame.K, pose, target, iterations)
         agreement = agreement_of(frame, pose, target)
-        at_edges = 0.0 if by_edges.failed else agreement_of(frame, by_edges.T_cam_obj, target)
-        if at_edges > agreement:
-            return replace(by_edges, confidence=at_edges)
-        done = by_edges.iterations
-        return Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=done, confidence=agreement)
+        if by_edges.failed:
+            done = by_edges.iterations
+            return Refinement(T_cam_obj=pose, status=Status.STOPPED, iterations=done, confidence=agreement)
+        at_edges = agreement_of(frame, by_edges.T_cam_obj, target)
+        best = by_edges.T_cam_obj if at_edges > agreement else pose
+        return replace(by_edges, T_cam_obj=best, confidence=max(at_edges, agreement))
 
     def _by_network(self, frame: Frame, found: Sequence[Refinement], target: Target) -> list[Refinement]:
         """What the network, if there is one, makes of poses: one that cannot judge only where that agrees more."""
@@ -159,13 +160,11 @@ def _confidence(found: Refinement) -> float:
 
 
 def agreement_of(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> float:
-    """How well a pose fits in the end, in [0, 1]; less where more than half of it lies outside of the image."""
+    """How well a pose fits in the end, in [0, 1]."""
     view = look(frame.image, frame.K, T_cam_obj, target, JUDGE_PX)
     if view is None:
         return 0.0
-    inside = 2 * (view.mask & view.in_image).sum() / view.mask.sum()
-    fit = gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.in_image[None])[0]
-    return float(fit * min(1.0, inside))
+    return float(gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.in_image[None])[0])
 
 
 def search(
