@@ -1,4 +1,6 @@
+import json
 import re
+import shutil
 import threading
 from dataclasses import replace
 
@@ -438,8 +440,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     ]
     result = cli("refine", *arguments, "--name", "mine", "--iterations", 2)
     assert result.exit_code == 0, result.output
-    assert "3 poses refined" in result.stdout
-    assert "1 failed (left out of the file" in result.stdout
+    assert "3 start poses, 2 refined (0 converged), 1 failed (left out of the file)" in result.stdout
     refined, starts = read_results(out, BopDataset(root)), read_results(start)
     assert all(0 < e.score < 1 and e.score != 0.9 for e in refined)  # how well the pose fits
     assert np.abs(refined[0].T_cam_obj - starts[0].T_cam_obj).max() > 1e-4
@@ -469,6 +470,76 @@ def test_refine_command(cli, bop, trained, tmp_path):
     why = f"after 1 updates its confidence is {doubted.score:.3f}, {between:g} needed"
     assert sidecar["failures"][str(doubted.line)] == why
     assert sidecar["start_lines"] == [{2: 3, 3: 2}[doubted.line]]
+
+
+def test_what_was_finished_is_written_when_something_ends_it(cli, bop, trained, tmp_path, monkeypatch):
+    root, start = bop
+    two = tmp_path / "two"
+    shutil.copytree(root, two)
+    for name in ("scene_camera.json", "scene_gt.json"):
+        file = two / "test" / "000001" / name
+        content = json.loads(file.read_text())
+        file.write_text(json.dumps({**content, "1": content["0"]}))
+    (picture,) = (two / "test" / "000001" / "rgb").iterdir()
+    second = picture.with_stem("000001")
+    second.write_bytes(picture.read_bytes()[:200])
+    lines = start.read_text().splitlines()
+    (tmp_path / "start.csv").write_text("\n".join([lines[0], lines[1].replace("1,0,1", "1,1,1", 1), *lines[1:]]) + "\n")
+    out = tmp_path / "x.csv"
+    rest = [
+        "--checkpoint",
+        trained,
+        "--dataset",
+        two,
+        "--init",
+        tmp_path / "start.csv",
+        "--out",
+        out,
+        "--iterations",
+        1,
+    ]
+    result = cli("refine", *rest)
+    assert result.exit_code == 1
+    assert f"Stopped: 1 start poses were not reached, {out} holds the others" in result.stderr
+    assert "000001" in result.stderr.splitlines()[-1]
+    assert result.stderr.splitlines()[-1].startswith("Error: ")
+    assert (len(read_results(out)), read_sidecar(out)["not_reached"]) == (2, 1)
+    assert read_sidecar(out)["start_lines"] == [3, 4]
+    shutil.copy(picture, second)
+    calls = []
+
+    def interrupted(self, frame, requests, original=Refiner.refine_batch):
+        calls.append(len(requests))
+        if len(calls) == interrupted.at:
+            raise KeyboardInterrupt
+        return original(self, frame, requests)
+
+    monkeypatch.setattr(Refiner, "refine_batch", interrupted)
+    interrupted.at = 2
+    result = cli("refine", *rest)
+    assert (result.exit_code, read_sidecar(out)["not_reached"]) == (130, 1)
+    before = out.read_bytes()
+    calls.clear()
+    interrupted.at = 1
+    result = cli("refine", *rest)
+    assert (result.exit_code, out.read_bytes()) == (130, before)
+    assert "nothing was written" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("image", "text"),
+    [
+        (np.zeros((HEIGHT_PX, WIDTH_PX), np.uint8), r"found uint8 of shape \(\d+, \d+\), expected uint8"),
+        (np.zeros((HEIGHT_PX, WIDTH_PX, 4), np.uint8), r"4\), expected uint8 of"),
+        (np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint16), "found uint16"),
+    ],
+)
+def test_an_image_that_is_no_8_bit_rgb_is_refused(image, text):
+    frame = object.__new__(Frame)  # the types that tests check would say it first
+    for name, value in (("image", image), ("K", K), ("depth_m", None)):
+        object.__setattr__(frame, name, value)
+    with pytest.raises(RefinementError, match=text):
+        frame.__post_init__()
 
 
 def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):

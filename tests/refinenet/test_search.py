@@ -11,6 +11,7 @@ from posecore.bop import Estimate, read_results, read_sidecar, write_results
 from posecore.camera import Camera, project
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from refinenet.agreement import gradient_agreement
 from refinenet.baselines import search as search_module
 from refinenet.baselines.outcome import failed
 from refinenet.baselines.search import (
@@ -313,14 +314,19 @@ def test_a_pose_outside_of_the_image_agrees_by_no_more_than_its_share_inside(tug
     with Rasteriser({1: tug}) as rasteriser:
         target = Target(obj_id=1, mesh=tug, rasteriser=rasteriser)
         frame, truth = rendered_frame(tug, rasteriser, 1)
-        whole = agreement_of(frame, truth, target)
-        columns = np.nonzero(rasteriser.render(1, frame.K, truth[None], *frame.image.shape[1::-1]).mask[0].any(axis=0))[
-            0
-        ]
-        image = np.ascontiguousarray(frame.image[:, : columns[0] + len(columns) // 6])
-        cut_off = agreement_of(replace(frame, image=image, depth_m=None), truth, target)
-    assert whole > 0.6
-    assert 0 < cut_off < 0.4
+        view = look(frame.image, frame.K, truth, target, 64)
+        assert agreement_of(frame, truth, target) > 0.6
+    columns = np.nonzero(view.mask.any(axis=0))[0]
+
+    def agreement(share):
+        inside = np.zeros_like(view.mask)
+        inside[:, : columns[0] + round(share * len(columns))] = True
+        return gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], inside[None])[0]
+
+    assert agreement(1) > 0.6
+    assert agreement(0.75) > 0.6
+    assert 0 < agreement(1 / 6) < 0.4
+    assert agreement(0) == 0
 
 
 def test_candidates_are_the_best_of_their_neighbourhood(tug):

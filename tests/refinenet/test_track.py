@@ -22,12 +22,15 @@ from posecore.bop import (
 )
 from posecore.bop import write_results as write
 from posecore.camera import Camera
+from posecore.errors import DatasetError
 from posecore.mesh import load_mesh, save_ply
 from posecore.raster import Instance, Rasteriser
 from posecore.symmetry import ContinuousSymmetry
 from refinenet import checkpoint
 from refinenet.config import load_config
+from refinenet.methods import make_baseline
 from refinenet.network import make_network
+from refinenet.sequence import FileCamera, ImageFolder, VideoFile, VideoWriter
 
 from .conftest import HEIGHT_PX, WIDTH_PX, K, background
 
@@ -194,12 +197,42 @@ def test_a_symmetric_object_does_not_spin_when_it_is_found_again(cli, bobbin_ply
     np.testing.assert_allclose(poses[0], offered[0], atol=1e-6)
 
 
+def test_names_with_numbers_are_in_their_order(tmp_path):
+    for number in (10, 2, 1):
+        cv2.imwrite(str(tmp_path / f"f{number}.png"), np.full((HEIGHT_PX, WIDTH_PX, 3), number, np.uint8))
+    folder = ImageFolder(folder=tmp_path, camera=FileCamera(file=tmp_path / "cam.json", K=K))
+    frames = list(folder.frames(make_baseline("edge-icp", {}, 1)))
+    assert [(number, frame.image[0, 0, 0]) for number, frame in frames] == [(0, 1), (1, 2), (2, 10)]
+
+
+def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
+    rng = np.random.default_rng(0)
+    with VideoWriter(tmp_path / "whole.avi", 10) as writer:
+        for _ in range(20):
+            writer.write(rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8))
+    content = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(content[: len(content) // 2])
+    camera, method = FileCamera(file=tmp_path / "cam.json", K=K), make_baseline("edge-icp", {}, 1)
+    assert len(list(VideoFile(file=tmp_path / "whole.avi", camera=camera).frames(method))) == 20
+    seen = []
+    with pytest.raises(DatasetError, match=r"cut\.avi: ends after frame \d+ of 20, it is damaged or cut off"):
+        seen.extend(number for number, _ in VideoFile(file=tmp_path / "cut.avi", camera=camera).frames(method))
+
+
 def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     root, _ = scene
     images = root / "test" / "000001" / "rgb"
     (tmp_path / "empty").mkdir()
     (tmp_path / "no.mp4").write_bytes(b"not a video")
     (tmp_path / "cam.json").write_text('{"fx": 1}')
+    known = json.loads((root / "cam.json").read_text())
+    (tmp_path / "big.json").write_text(json.dumps({**known, "width": WIDTH_PX + 1, "height": HEIGHT_PX}))
+    metres = [{"obj_id": 1, "cam_R_m2c": [1, 0, 0, 0, 1, 0, 0, 0, 1], "cam_t_m2c": [0, 0, 0.5]}]
+    (tmp_path / "metres.json").write_text(json.dumps(metres))
+    (tmp_path / "twins").mkdir()
+    for name in ("1.png", "01.png"):
+        shutil.copy(next(images.iterdir()), tmp_path / "twins" / name)
+    mesh_file = next((root / "models").glob("*.ply"))
     init, pose, camera = ["--init", root / "start.csv"], ["--pose", root / "pose.json"], ["--camera", root / "cam.json"]
     for arguments, code, text in (
         ([tmp_path / "none", *init], 1, "no such folder or file"),
@@ -213,6 +246,12 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([root, *init, "--sure", 0.2, "--found", 0.4], 2, "expected 0 <= found <= sure"),
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
+        ([root, *init, *camera], 2, "--camera is for images and videos"),
+        ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
+        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 looks like metres"),
+        ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
+        ([tmp_path / "twins", *pose, *camera], 1, "01.png and 1.png have one number"),
+        ([root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),
     ):
         result = cli("track", *arguments, "--checkpoint", still, "--out", tmp_path / "x.csv", "--quiet")
         assert result.exit_code == code, result.output

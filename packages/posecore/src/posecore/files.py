@@ -30,6 +30,22 @@ def write_atomic(path: str | Path, data: bytes) -> None:
         raise storage_error(file, error, len(data)) from error
 
 
+def require_writable(path: str | Path) -> None:
+    """Refuse a file that cannot be written, before the work that would go into it; makes its folder.
+
+    Raises:
+        StorageError: No rights, no space, or no such folder can be.
+    """
+    file = Path(path)
+    trial = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise storage_error(file, error) from error
+
+
 def storage_error(path: str | Path, error: OSError, size_bytes: int | None = None) -> StorageError:
     """Turn an OSError into one line that says what to do."""
     if error.errno == errno.ENOSPC:

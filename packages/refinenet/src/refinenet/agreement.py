@@ -29,8 +29,8 @@ def gradient_agreement(
     An edge pixel of the render, silhouette included, counts with the cosine of twice the angle between both gradients
     where the image has an edge too, and with 0 where it has none: equal and opposite gradients count 1, perpendicular
     ones -1, and orientations that have nothing to do with each other cancel. (The mean of the absolute cosine itself,
-    as in LINE-2D, would be 0.64 for those.) A negative mean is 0. Where more than half of the silhouette lies outside of
-    the image the mean is over few pixels and says little, so it counts the less, down to 0 where nothing lies inside.
+    as in LINE-2D, would be 0.64 for those.) A negative mean is 0. Where more than half of the silhouette lies outside
+    of the image the mean is over few pixels and counts less, down to 0 where nothing lies inside.
 
     Args:
         scene_rgb: Patches of the image.

@@ -8,4 +8,4 @@ class TrainingError(PoseError, ArithmeticError):
 
 
 class RefinementError(PoseError, RuntimeError):
-    """Poses cannot be refined on this machine: its memory is too small for one of them."""
+    """Poses cannot be refined: the image is none, or this machine's memory is too small for one of them."""

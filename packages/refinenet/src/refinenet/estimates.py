@@ -23,53 +23,90 @@ CARRIED = "perturbation"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class One:
+    """One start pose, what came of it, and how long its image took."""
+
+    start: Estimate
+    result: Refinement
+    taken_s: float
+
+    def estimate(self, found: Refinement) -> Estimate:
+        """A pose that was found from the start, as a line of a result file."""
+        unfailed = self.start.score if found.confidence is None else found.confidence
+        score = 0.0 if found.failed else float(unfailed)
+        return replace(self.start, T_cam_obj=np.asarray(found.T_cam_obj), score=score, time_s=self.taken_s)
+
+
+@dataclass(kw_only=True, eq=False)
 class Refined:
-    """A refined result file in memory.
+    """A refined result file in memory, as far as it has come.
 
     Attributes:
-        estimates: In the order of the start poses. Those that failed are left out, and evaluation counts them as
-            missing; or they are the start poses as they were, with score 0.
-        start_lines: Line in the start file of each of them.
-        failures: Why poses failed, by their line in the start file.
-        converged: How many stopped on a small update.
-        tried: Every pose that the method weighed, of all start poses, those that failed too.
+        keep_failed: Whether a start pose whose refinement failed is an estimate as it was, with score 0, or left out,
+            so that evaluation counts it as missing.
+        done: By the place of the start pose.
     """
 
-    estimates: list[Estimate]
-    start_lines: list[int]
-    failures: dict[int, str] = field(default_factory=dict)
-    converged: int = 0
-    tried: list[Estimate] = field(default_factory=list)
+    keep_failed: bool = False
+    done: dict[int, One] = field(default_factory=dict)
+
+    @property
+    def all(self) -> list[One]:
+        """In the order of the start poses."""
+        return [self.done[place] for place in sorted(self.done)]
+
+    @property
+    def kept(self) -> list[One]:
+        """Those that are estimates."""
+        return [one for one in self.all if self.keep_failed or not one.result.failed]
+
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Lines of the result file."""
+        return [one.estimate(one.result) for one in self.kept]
+
+    @property
+    def failures(self) -> dict[int, str]:
+        """Why poses failed, by their line in the start file."""
+        return {one.start.line: one.result.failure or "" for one in self.all if one.result.failed}
+
+    @property
+    def converged(self) -> int:
+        """How many stopped on a small update."""
+        return sum(one.result.status is Status.CONVERGED for one in self.all)
+
+    @property
+    def tried(self) -> list[Estimate]:
+        """Every pose that the method weighed, from all start poses, those that failed too."""
+        return [one.estimate(found) for one in self.all for found in one.result.tried]
 
 
 def refine_estimates(
     dataset: BopDataset,
     starts: Sequence[Estimate],
     method: PoseRefiner,
+    refined: Refined,
     *,
-    keep_failed: bool = False,
     overlay: Path | None = None,
     on_image: Callable[[int], None] | None = None,
-) -> Refined:
-    """Refine every start pose in its image.
+) -> None:
+    """Refine every start pose in its image, adding to `refined` as it goes, so that an error loses nothing.
+
+    An estimate's score is the method's confidence (the start's score where it has none), its time that of refining all
+    poses of its image, rendering included, reading excluded.
 
     Args:
         dataset: Images and cameras.
         starts: Start poses.
         method: With the meshes of all their objects.
-        keep_failed: Whether a start pose whose refinement failed is an estimate, with score 0, or left out.
+        refined: Filled.
         overlay: Folder for one picture an image, start contours red, refined ones green.
         on_image: Called after each image with the number of poses in it.
-
-    Returns:
-        Estimates whose score is the method's confidence (the start's score where it has none), and whose time is that
-        of refining all poses of their image, rendering included, reading excluded.
 
     Raises:
         DatasetError: The method needs depth, and an image has none.
         CameraError: An image's camera is that of an image of another size.
     """
-    results: list[tuple[Refinement, float] | None] = [None] * len(starts)
     order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
     drawing = closing(Overlay({i: dataset.mesh(i) for i in sorted({s.obj_id for s in starts})})) if overlay else None
     with drawing or nullcontext() as painter:
@@ -81,7 +118,7 @@ def refine_estimates(
             found = method.refine_batch(frame, requests)
             taken_s = time.perf_counter() - begun
             for i, result in zip(rows, found, strict=True):
-                results[i] = result, taken_s
+                refined.done[i] = One(start=starts[i], result=result, taken_s=taken_s)
             if painter is not None and overlay is not None:
                 picture = painter.draw(frame.image, frame.K, requests, START_RGB)
                 good = [
@@ -93,15 +130,6 @@ def refine_estimates(
                 write_image(overlay / f"{scene_id:06d}_{im_id:06d}.png", picture)
             if on_image is not None:
                 on_image(len(rows))
-    pairs = [(start, *result) for start, result in zip(starts, results, strict=True) if result is not None]
-    kept = [(start, result, taken_s) for start, result, taken_s in pairs if keep_failed or not result.failed]
-    return Refined(
-        estimates=[_estimate(start, result, taken_s) for start, result, taken_s in kept],
-        start_lines=[start.line for start, _, _ in kept],
-        failures={start.line: result.failure or "" for start, result, _ in pairs if result.failed},
-        tried=[_estimate(start, one, taken_s) for start, result, taken_s in pairs for one in result.tried],
-        converged=sum(result.status is Status.CONVERGED for _, result, _ in kept),
-    )
 
 
 def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:
@@ -118,12 +146,6 @@ def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefin
         )
     image = dataset.rgb(scene_id, im_id)
     return Frame(image=image, K=dataset.camera(scene_id, im_id).K, depth_m=depth_m)
-
-
-def _estimate(start: Estimate, result: Refinement, taken_s: float) -> Estimate:
-    unfailed = start.score if result.confidence is None else result.confidence
-    score = 0.0 if result.failed else unfailed
-    return replace(start, T_cam_obj=np.asarray(result.T_cam_obj), score=float(score), time_s=taken_s)
 
 
 def make_sidecar(
@@ -147,7 +169,7 @@ def make_sidecar(
     sidecar |= {
         "settings": {"refinenet": __version__, **method.settings},
         "init": start_path.name,
-        "start_lines": refined.start_lines,
+        "start_lines": [one.start.line for one in refined.kept],
         "failed_lines": list(refined.failures),
         "failures": {str(line): why for line, why in refined.failures.items()},
     }

@@ -1,19 +1,13 @@
-"""What is checked before a pose is refined: the object, the camera, the units."""
+"""What is checked of an object before its poses are refined: is it the trained one, in the trained unit."""
 
-from posecore.camera import Camera
-from posecore.errors import CameraError, CheckpointError
+from posecore.errors import CheckpointError
 from posecore.mesh import Mesh, mesh_digest
 
 from refinenet.checkpoint import Checkpoint
-from refinenet.methods import Frame
 
 DIAMETER_TOLERANCE = 0.02
 MEMBER_SIZES = (0.8, 1.25)
 """Smallest and largest member of a category, as shares of the smallest and largest trained one's diameter."""
-
-CENTRE_TOLERANCE = 0.2
-"""A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
-that of an image of another size."""
 
 
 def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:
@@ -68,21 +62,3 @@ def _require_member(loaded: Checkpoint, obj_id: int, mesh: Mesh) -> None:
 
 
 _UNITS = {1e3: "a thousand times", 1e-3: "a thousand times", 10.0: "ten times", 0.1: "ten times"}
-
-
-def require_camera(frame: Frame) -> None:
-    """Refuse a camera matrix that is none, or that of an image of another size.
-
-    Raises:
-        CameraError: So it is.
-    """
-    height, width = frame.image.shape[:2]
-    K = Camera(K=frame.K, width_px=width, height_px=height).K
-    across, down = K[0, 2] / width, K[1, 2] / height
-    is_scaled = abs(across - down) < 0.1 and min(abs(across - 0.5), abs(down - 0.5)) > CENTRE_TOLERANCE
-    if not (0 <= across <= 1 and 0 <= down <= 1) or is_scaled:
-        raise CameraError(
-            f"camera matrix: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not fit an image of "
-            f"{width} x {height} px; it looks like that of {2 * K[0, 2]:.0f} x {2 * K[1, 2]:.0f} px: "
-            "scale K with the image"
-        )

@@ -11,9 +11,16 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore.camera import Camera
+from posecore.errors import CameraError
 from posecore.mesh import Mesh
 
+from refinenet.errors import RefinementError
+
 Array = np.ndarray
+CENTRE_TOLERANCE = 0.2
+"""A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
+that of an image of another size."""
 
 NETWORK = "network"
 BASELINES: dict[str, str] = {
@@ -44,11 +51,37 @@ class Frame:
         image: RGB.
         K: Its camera matrix, pixel centres at + 0.5.
         depth_m: Camera z in metres, 0 where unknown; None where there is no depth.
+
+    Raises:
+        RefinementError: The image is no 8-bit RGB, or the depth has another size.
+        CameraError: K is no camera matrix, or that of an image of another size.
     """
 
     image: UInt8[Array, "h w 3"]
     K: Float[Array, "3 3"]
     depth_m: Float[Array, "h w"] | None = None
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image)
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            raise RefinementError(
+                f"image: found {image.dtype} of shape {image.shape}, expected uint8 of (height, width, 3), RGB"
+            )
+        if self.depth_m is not None and np.shape(self.depth_m) != image.shape[:2]:
+            raise RefinementError(
+                f"depth: found shape {np.shape(self.depth_m)}, expected the image's {image.shape[:2]}"
+            )
+        height, width = image.shape[:2]
+        K = Camera(K=self.K, width_px=width, height_px=height).K
+        object.__setattr__(self, "K", K)
+        across, down = K[0, 2] / width, K[1, 2] / height
+        is_scaled = abs(across - down) < 0.1 and min(abs(across - 0.5), abs(down - 0.5)) > CENTRE_TOLERANCE
+        if not (0 <= across <= 1 and 0 <= down <= 1) or is_scaled:
+            raise CameraError(
+                f"camera matrix: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not fit an image of "
+                f"{width} x {height} px; it looks like that of {2 * K[0, 2]:.0f} x {2 * K[1, 2]:.0f} px: "
+                "scale K with the image"
+            )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from posecore import se3
-from posecore.errors import CheckpointError
+from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import Mesh
 
 from refinenet import checkpoint
@@ -20,7 +20,7 @@ from refinenet.checkpoint import Checkpoint
 from refinenet.device import choose_device
 from refinenet.errors import RefinementError
 from refinenet.geometry import PoseUpdate
-from refinenet.inputs import require_camera, require_trained
+from refinenet.inputs import require_trained
 from refinenet.methods import Frame, Refinement, Request, Status
 from refinenet.network import Pair
 from refinenet.views import Viewer, Views
@@ -69,7 +69,7 @@ class Refiner:
 
     Raises:
         CheckpointError: An object was not trained, or its mesh is not the trained one.
-        ConfigError: A GPU is asked for and there is none.
+        ConfigError: A GPU is asked for and there is none; less than one iteration or pose in a pass.
         RenderError: There is no device to render on.
     """
 
@@ -86,6 +86,9 @@ class Refiner:
         allow_other_mesh: bool = False,
         min_confidence: float = 0.0,
     ) -> None:
+        for name, value in (("iterations", iterations), ("batch", batch)):
+            if value < 1:
+                raise ConfigError(f"{name} is {value}, expected 1 or more")
         for obj_id, mesh in sorted(meshes.items()):
             require_trained(loaded, obj_id, mesh, allow_other_mesh=allow_other_mesh)
         self.checkpoint = loaded
@@ -154,13 +157,17 @@ class Refiner:
 
         Raises:
             CameraError: K is no camera matrix, or that of an image of another size.
-            RefinementError: The GPU's memory is too small for a single pose.
+            ConfigError: The object has no mesh here.
+            RefinementError: The image is no 8-bit RGB, or the GPU's memory is too small for a single pose.
         """
         return self.refine_batch(Frame(image=image, K=K), [Request(obj_id=obj_id, T_cam_obj=T_cam_obj)])[0]
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses in one image, of any objects, all of them together; see `refine` for errors."""
-        require_camera(frame)
+        for request in requests:
+            if request.obj_id not in self.meshes:
+                known = ", ".join(map(str, sorted(self.meshes)))
+                raise ConfigError(f"object {request.obj_id} has no mesh here, there are those of {known}")
         b = len(requests)
         batch = _Batch(
             T=_poses(requests), obj_id=_objects(requests), converged=np.zeros(b, bool),

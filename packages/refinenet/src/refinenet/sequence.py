@@ -1,6 +1,8 @@
 """Where tracked frames come from: a BOP scene, a folder of images, a video file."""
 
+import itertools
 import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +20,8 @@ from refinenet.estimates import load_frame
 from refinenet.methods import Frame, PoseRefiner
 
 Array = np.ndarray
+MIN_SHARE = 0.9
+"""Of the frames that a video's file promises; containers count inexactly."""
 
 
 @runtime_checkable
@@ -63,16 +67,23 @@ class BopScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageFolder:
-    """The images of a folder in the order of their names: numbers are numbered so, other names from 0."""
+    """The images of a folder, by the numbers in their names: `f2` is before `f10`.
+
+    Names that are numbers are the frames' numbers, others are numbered from 0.
+    """
 
     folder: Path
-    K: Float[Array, "3 3"]
+    camera: "FileCamera"
     scene_id: int = 0
 
     def __post_init__(self) -> None:
-        if not self._files():
+        files = self._files()
+        if not files:
             kinds = ", ".join(COLOUR_EXTENSIONS)
             raise DatasetError(f"{self.folder}: no images ({kinds}) in it; give a folder of images")
+        for one, other in itertools.pairwise(files):
+            if one.stem.isdecimal() and other.stem.isdecimal() and int(one.stem) == int(other.stem):
+                raise DatasetError(f"{self.folder}: {one.name} and {other.name} have one number; keep one of them")
 
     def __len__(self) -> int:
         return len(self._files())
@@ -82,13 +93,17 @@ class ImageFolder:
         _refuse_depth(method, self.folder)
         files = self._files()
         are_numbers = all(file.stem.isdecimal() for file in files)
-        if are_numbers:
-            files = sorted(files, key=lambda file: int(file.stem))
         for index, file in enumerate(files):
-            yield int(file.stem) if are_numbers else index, Frame(image=read_rgb(file), K=self.K)
+            yield int(file.stem) if are_numbers else index, self.camera.frame(read_rgb(file), str(file))
 
     def _files(self) -> list[Path]:
-        return sorted(p for p in self.folder.iterdir() if p.suffix.lower().lstrip(".") in COLOUR_EXTENSIONS)
+        images = (p for p in self.folder.iterdir() if p.suffix.lower().lstrip(".") in COLOUR_EXTENSIONS)
+        return sorted(images, key=_with_numbers)
+
+
+def _with_numbers(file: Path) -> tuple[list[tuple[str, int]], str]:
+    """A file name's text and numbers in turn."""
+    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", file.stem)], file.name
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,7 +111,7 @@ class VideoFile:
     """The frames of a video file, from 0, as OpenCV decodes them."""
 
     file: Path
-    K: Float[Array, "3 3"]
+    camera: "FileCamera"
     scene_id: int = 0
 
     def __post_init__(self) -> None:
@@ -122,12 +137,17 @@ class VideoFile:
                 ok, image = video.read()
                 if not ok:
                     break
-                yield number, Frame(image=_rgb(image), K=self.K)
+                yield number, self.camera.frame(_rgb(image), str(self.file))
                 number += 1
         finally:
             video.release()
         if number == 0:
             raise DatasetError(f"{self.file}: no frame can be decoded; convert it, or give a folder of images")
+        if number < MIN_SHARE * len(self):
+            raise DatasetError(
+                f"{self.file}: ends after frame {number} of {len(self)}, it is damaged or cut off; "
+                "copy or convert it anew"
+            )
 
 
 def _refuse_depth(method: PoseRefiner, source: Path) -> None:
@@ -146,12 +166,14 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
 
     Raises:
         DatasetError: There is no such path, or it holds no frames.
-        ConfigError: A scene must be chosen, or a camera is missing.
+        ConfigError: A scene must be chosen, a camera is missing, or an option is for the other kind of source.
         CameraError: The camera file is no camera.
     """
     if not source.exists():
         raise DatasetError(f"{source}: no such folder or file; give a BOP dataset, a folder of images or a video")
     if source.is_dir() and any(source.glob("models*")):
+        if camera is not None:
+            raise ConfigError("--camera is for images and videos; a BOP dataset brings its own cameras")
         dataset = BopDataset(source, split)
         if scene is None and len(dataset.scene_ids) > 1:
             some = ", ".join(map(str, dataset.scene_ids[:10]))
@@ -159,23 +181,56 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
         chosen = BopScene(dataset=dataset, scene_id=dataset.scene_ids[0] if scene is None else scene)
         dataset.scene_path(chosen.scene_id)
         return chosen
+    if split is not None:
+        raise ConfigError(f"--split is for BOP datasets; {source} has no models folder, so it is none")
     if camera is None:
         raise ConfigError(f"{source}: images and videos need --camera, a BOP camera.json with fx, fy, cx, cy")
-    K = read_camera(camera)
+    seen_by = read_camera(camera)
     if source.is_dir():
-        return ImageFolder(folder=source, K=K, scene_id=scene or 0)
-    return VideoFile(file=source, K=K, scene_id=scene or 0)
+        return ImageFolder(folder=source, camera=seen_by, scene_id=scene or 0)
+    return VideoFile(file=source, camera=seen_by, scene_id=scene or 0)
 
 
-def read_camera(file: Path) -> Float[Array, "3 3"]:
-    """Camera matrix of a BOP `camera.json`: fx, fy, cx, cy in pixels.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FileCamera:
+    """A camera from a file.
+
+    Attributes:
+        file: Where it stands.
+        K: Camera matrix.
+        size_px: Width and height of its images; None where the file does not say.
+    """
+
+    file: Path
+    K: Float[Array, "3 3"]
+    size_px: tuple[int, int] | None = None
+
+    def frame(self, image: UInt8[Array, "h w 3"], name: str) -> Frame:
+        """An image that this camera took.
+
+        Raises:
+            CameraError: It has another size than the camera.
+        """
+        found = (image.shape[1], image.shape[0])
+        if self.size_px is not None and found != self.size_px:
+            raise CameraError(
+                f"{name}: found {found[0]} x {found[1]} px, expected {self.size_px[0]} x {self.size_px[1]} px as "
+                f"{self.file} says; give the camera of these images"
+            )
+        return Frame(image=image, K=self.K)
+
+
+def read_camera(file: Path) -> FileCamera:
+    """A BOP `camera.json`: fx, fy, cx, cy in pixels, and width and height where they are given.
 
     Raises:
-        CameraError: The file is missing, not JSON, or lacks one of them.
+        CameraError: The file is missing, not JSON, or lacks one of the former.
     """
     try:
         content: Any = json.loads(file.read_text(encoding="utf-8"))
-        return intrinsics(*(float(content[key]) for key in ("fx", "fy", "cx", "cy")))
+        K = intrinsics(*(float(content[key]) for key in ("fx", "fy", "cx", "cy")))
+        size_px = (int(content["width"]), int(content["height"])) if {"width", "height"} <= set(content) else None
+        return FileCamera(file=file, K=K, size_px=size_px)
     except OSError as error:
         raise CameraError(f"{file}: cannot be read ({error.strerror}); give a BOP camera.json") from error
     except (ValueError, KeyError, TypeError) as error:

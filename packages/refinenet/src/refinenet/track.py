@@ -77,9 +77,9 @@ def track_sequence(
             started = time.perf_counter()
             found = tracker.step(number, frame, offered(number))
             taken_s = time.perf_counter() - started
-            _note(log, sequence.scene_id, number, found, taken_s)
             if writer is not None and painter is not None:
                 writer.write(annotated(frame, number, found, painter))
+            _note(log, sequence.scene_id, number, found, taken_s)
             log.total_s = time.perf_counter() - begun
             if on_frame is not None:
                 on_frame()

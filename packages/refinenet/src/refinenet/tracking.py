@@ -53,6 +53,8 @@ class TrackingConfig:
 # them under 0.42), a true pose 0.65, one that is 40 degrees and 0.2 diameters off 0.05 with a deviation of 0.05.
 GRADIENT_TRACKING = TrackingConfig(sure=0.35, found=0.2)
 LEARNED_TRACKING = TrackingConfig(sure=0.5, found=0.2)
+SEARCH_TRACKING = TrackingConfig(sure=0.4, found=0.4, depth_step=0.0)
+"""For `search`, whose poses under its own least agreement fail."""
 UNJUDGED_TRACKING = TrackingConfig(sure=0.5, found=0.2, depth_step=0.0)
 """For methods without confidences: a pose fits unless it fails, and none of three depths is the best."""
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from posecore import se3
 from posecore.camera import crop_K, project
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
@@ -14,10 +15,14 @@ from refinenet.checkpoint import Provenance
 from refinenet.methods import Frame
 
 Array = np.ndarray
+SUSPICIOUS_M = 0.01
+"""A pose nearer than this was divided by a thousand once too often."""
 NEAREST_DIAMETERS = 0.6
 """An object whose centre is nearer than so many diameters reaches the camera."""
 FARTHEST_DIAMETERS = 500.0
 """A pose further away is in another unit: the object would be about a pixel wide."""
+ROTATION_TOLERANCE = 0.02
+"""Of a rotation's orthonormality; result files are written with few digits."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,10 +118,13 @@ class Viewer:
         """Why a pose cannot even be drawn, or None."""
         if not np.isfinite(T).all():
             return "its pose is not finite"
+        if not se3.is_rotation(T[:3, :3], ROTATION_TOLERANCE):
+            return "its rotation is none: scaled, mirrored or sheared"
         mesh = self._meshes[obj_id]
         z_m = float(T[2, :3] @ mesh.center_m + T[2, 3])
         if z_m < NEAREST_DIAMETERS * mesh.diameter_m:
-            return f"at z = {z_m:.3g} m it is behind the camera or reaches it"
+            unit = "; were metres taken for millimetres?" if 0 < z_m < SUSPICIOUS_M else ""
+            return f"at z = {z_m:.3g} m it is behind the camera or reaches it{unit}"
         if z_m > FARTHEST_DIAMETERS * mesh.diameter_m:
             return (
                 f"it is {z_m:.6g} m away with a diameter of {mesh.diameter_m:.3g} m; were millimetres taken for metres?"

@@ -4,7 +4,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 import click
 
@@ -27,6 +27,14 @@ def stoppable(where: Path) -> Iterator[None]:
     except KeyboardInterrupt:
         click.echo(f"Stopped; what was finished is in {where}", err=True)
         raise SystemExit(130) from None
+
+
+def end_early(stopped: BaseException, line: str) -> NoReturn:
+    """End with one line, after what was finished was written: an interruption with exit code 130, or the error."""
+    click.echo(line, err=True)
+    if isinstance(stopped, KeyboardInterrupt):
+        raise SystemExit(130)
+    raise stopped
 
 
 def progress_bar(quiet: bool, *extra: str) -> "Progress":

@@ -1,6 +1,6 @@
 """What several commands' options have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
@@ -32,6 +32,17 @@ other_mesh_option = click.option(
 )
 quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
 verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")
+
+
+def require_apart(read: Mapping[str, Path | None], written: Mapping[str, Path | None]) -> None:
+    """Refuse an output that is an input, or another output; both by the names of their options."""
+    known = {path.resolve(): name for name, path in read.items() if path is not None}
+    for name, path in written.items():
+        if path is None:
+            continue
+        other = known.setdefault(path.resolve(), name)
+        if other != name:
+            raise click.UsageError(f"{name} and {other} are both {path}: name two files")
 
 
 def require_fit(method: str, checkpoint: Path | None, with_network: Sequence[str] = ()) -> None:

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from posecore.errors import ConfigError
+from posecore.errors import ConfigError, PoseError
 
-from refinenet.cli.console import progress_bar, start_logging, stoppable
+from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -16,6 +16,7 @@ from refinenet.cli.options import (
     method_option,
     other_mesh_option,
     quiet_option,
+    require_apart,
     require_fit,
     threads_option,
     verbose_option,
@@ -113,13 +114,13 @@ def refine(
         )
     if candidates is not None and method not in WITH_NETWORK:
         raise click.UsageError(f"--candidates is for --method {WITH_NETWORK[0]}, {method} follows one pose")
-    if candidates is not None and candidates.resolve() == out.resolve():
-        raise click.UsageError(f"--candidates and --out are both {out}: name two files")
+    require_apart({"--init": init, "--checkpoint": checkpoint}, {"--out": out, "--candidates": candidates})
     import torch
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
+    from posecore.files import require_writable
 
     from refinenet import checkpoint as checkpoints
-    from refinenet.estimates import make_sidecar, refine_estimates
+    from refinenet.estimates import Refined, make_sidecar, refine_estimates
     from refinenet.methods import PoseRefiner
     from refinenet.pool import PooledRefiner
     from refinenet.refine import Refiner
@@ -128,9 +129,15 @@ def refine(
         torch.set_num_threads(threads)
     loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     bop = BopDataset(dataset, split)
-    starts = [s for s in read_results(init, bop) if not objects or s.obj_id in objects]
+    given = read_results(init, bop)
+    starts = [s for s in given if not objects or s.obj_id in objects]
+    if not given:
+        raise ConfigError(f"{init}: no poses in it, there is nothing to refine")
     if not starts:
         raise ConfigError(f"{init}: no pose of object {', '.join(map(str, objects))}; change --object")
+    start_sidecar = read_sidecar(init) or {}
+    for path in filter(None, (out, candidates)):
+        require_writable(path)
     meshes = {i: bop.mesh(i) for i in sorted({s.obj_id for s in starts})}
     network: Refiner | None = None
     if loaded is not None:
@@ -142,23 +149,24 @@ def refine(
         refiner: PoseRefiner = make_baseline(method, meshes, iterations, network=network, min_confidence=min_confidence)
     else:
         refiner = network if hypotheses == 1 else PooledRefiner(network, hypotheses, scorer, seed)
+    result, stopped = Refined(keep_failed=keep_failed), None
     try:
-        with stoppable(out), progress_bar(quiet) as bar:
+        with progress_bar(quiet) as bar:
             task = bar.add_task("poses", total=len(starts))
-            result = refine_estimates(
-                bop,
-                starts,
-                refiner,
-                keep_failed=keep_failed,
-                overlay=overlay,
-                on_image=lambda n: bar.advance(task, n),
-            )
+            refine_estimates(bop, starts, refiner, result, overlay=overlay, on_image=lambda n: bar.advance(task, n))
+    except (KeyboardInterrupt, PoseError, OSError) as error:
+        stopped = error
     finally:
         refiner.close()
+    if stopped is not None and not result.done:
+        end_early(stopped, "Stopped before the first image was done: nothing was written")
     sidecar = make_sidecar(
         dataset=bop, method=refiner, name=name or refiner.name, loaded=loaded, start_path=init,
-        start_sidecar=read_sidecar(init) or {}, refined=result,
+        start_sidecar=start_sidecar, refined=result,
     )  # fmt: skip
+    left = len(starts) - len(result.done)
+    if left:
+        sidecar["not_reached"] = left
     write_results(out, result.estimates, sidecar)
     if candidates is not None:
         of_all = {key: sidecar[key] for key in ("dataset", "split", "settings", "init")}
@@ -171,6 +179,9 @@ def refine(
     if len(result.failures) > SHOWN_FAILURES:
         click.echo(f"Failed: {len(result.failures) - SHOWN_FAILURES} more, listed in {out}.json", err=True)
     click.echo(
-        f"{out}: {len(starts)} poses refined, {result.converged} converged, {len(result.failures)} failed"
+        f"{out}: {len(result.done)} start poses, {len(result.done) - len(result.failures)} refined "
+        f"({result.converged} converged), {len(result.failures)} failed"
         + (f" ({'start poses kept' if keep_failed else 'left out of the file'})" if result.failures else "")
     )
+    if stopped is not None:
+        end_early(stopped, f"Stopped: {left} start poses were not reached, {out} holds the others")

@@ -1,14 +1,15 @@
 """`refinenet track`."""
 
 import re
+from collections import Counter
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from posecore.errors import ConfigError
+from posecore.errors import ConfigError, PoseError
 
-from refinenet.cli.console import progress_bar, start_logging
+from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -18,6 +19,7 @@ from refinenet.cli.options import (
     method_option,
     other_mesh_option,
     quiet_option,
+    require_apart,
     require_fit,
     threads_option,
     verbose_option,
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 
     from refinenet.checkpoint import Checkpoint
     from refinenet.sequence import FrameSequence
+
+SHOWN_REASONS = 3
+SUSPICIOUS_M = 0.01
+"""An object nearer than this was given in another unit."""
 
 
 @click.command()
@@ -111,17 +117,28 @@ def track(
     require_fit(method, checkpoint)
     if (init is None) == (pose is None):
         raise click.UsageError("give either --init or --pose: where the objects are at the start")
+    require_apart(
+        {"SOURCE": source, "--init": init, "--pose": pose, "--camera": camera, "--checkpoint": checkpoint},
+        {"--out": out, "--video": video},
+    )
     import torch
     from posecore.bop import write_results
+    from posecore.files import require_writable
 
     from refinenet import __version__
     from refinenet import checkpoint as checkpoints
-    from refinenet.methods import PoseRefiner, make_baseline
+    from refinenet.methods import WITH_CONFIDENCE, PoseRefiner, make_baseline
     from refinenet.refine import Refiner
     from refinenet.sequence import BopScene, open_sequence
     from refinenet.track import TrackLog, track_sequence
     from refinenet.tracker import Tracker
-    from refinenet.tracking import GRADIENT_TRACKING, LEARNED_TRACKING, UNJUDGED_TRACKING, TrackingConfig
+    from refinenet.tracking import (
+        GRADIENT_TRACKING,
+        LEARNED_TRACKING,
+        SEARCH_TRACKING,
+        UNJUDGED_TRACKING,
+        TrackingConfig,
+    )
 
     if threads:
         torch.set_num_threads(threads)
@@ -129,10 +146,13 @@ def track(
     sequence = open_sequence(source, split=split, scene=scene, camera=camera)
     starts = _Starts(init, pose, sequence, objects)
     meshes, infos = _models(sequence, mesh_files, loaded, starts.obj_ids)
-    log, stopped = TrackLog(), False
+    for path in filter(None, (out, video)):
+        require_writable(path)
+    log, stopped = TrackLog(), None
     refiner: PoseRefiner
     if loaded is None:
-        refiner, usual = make_baseline(method, meshes, iterations), UNJUDGED_TRACKING
+        refiner = make_baseline(method, meshes, iterations)
+        usual = SEARCH_TRACKING if method in WITH_CONFIDENCE else UNJUDGED_TRACKING
     else:
         refiner = Refiner(loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh)
         usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
@@ -151,23 +171,25 @@ def track(
                 sequence, tracker, starts.offered, log, meshes=meshes, video=video, fps=fps,
                 on_frame=lambda: bar.advance(task),
             )  # fmt: skip
-        except KeyboardInterrupt:
-            stopped = True
-        sidecar: dict[str, Any] = {"method": name or f"{refiner.name}, tracking"}
-        if isinstance(sequence, BopScene):
-            sidecar |= {"dataset": str(sequence.dataset.root.resolve()), "split": sequence.dataset.split}
-        if loaded is not None:
-            sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
-        sidecar |= {
-            "settings": {
-                "refinenet": __version__, **refiner.settings, "motion_model": motion_model, "sure": config.sure,
-                "found": config.found, "patience_frames": config.patience, "depth_step": config.depth_step,
-            },
-            "init": (init or pose or source).name,
-            "states": {str(state): count for state, count in log.states.items()},
-            "resets": log.resets,
-            "misses": log.misses,
-        }  # fmt: skip
+        except (KeyboardInterrupt, PoseError, OSError) as error:
+            stopped = error
+    if stopped is not None and not log.frames:
+        end_early(stopped, "Stopped before the first frame was done: nothing was written")
+    sidecar: dict[str, Any] = {"method": name or f"{refiner.name}, tracking"}
+    if isinstance(sequence, BopScene):
+        sidecar |= {"dataset": str(sequence.dataset.root.resolve()), "split": sequence.dataset.split}
+    if loaded is not None:
+        sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
+    sidecar |= {
+        "settings": {
+            "refinenet": __version__, **refiner.settings, "motion_model": motion_model, "sure": config.sure,
+            "found": config.found, "patience_frames": config.patience, "depth_step": config.depth_step,
+        },
+        "init": (init or pose or source).name,
+        "states": {str(state): count for state, count in log.states.items()},
+        "resets": log.resets,
+        "misses": log.misses,
+    }  # fmt: skip
     write_results(out, log.estimates, sidecar)
     counts = ", ".join(f"{count} {state}" for state, count in log.states.items())
     click.echo(f"{out}: {log.frames} frames, {counts}; {len(log.resets)} starts from a given pose")
@@ -176,9 +198,10 @@ def track(
             f"{log.frames / log.tracking_s:.1f} frames/s tracking, "
             f"{log.frames / log.total_s:.1f} with reading{' and drawing' if video else ''}"
         )
-    if stopped:
-        click.echo(f"Stopped; what was tracked is in {out}", err=True)
-        raise SystemExit(130)
+    for why, count in Counter(miss["why"] for miss in log.misses).most_common(SHOWN_REASONS):
+        click.echo(f"No pose, {count} times: {why}", err=True)
+    if stopped is not None:
+        end_early(stopped, f"Stopped; what was tracked is in {out}")
 
 
 class _Starts:
@@ -216,6 +239,12 @@ def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
     from posecore.bop.jsonfile import read_json
 
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
+    nearest_m = min((abs(float(pose.T_cam_obj[2, 3])) for pose in poses), default=SUSPICIOUS_M)
+    if nearest_m < SUSPICIOUS_M:
+        raise ConfigError(
+            f"{file}: a t_z of {1e3 * nearest_m:.4g} looks like metres; "
+            "cam_t_m2c is in millimetres, multiply it by 1000"
+        )
     return [(pose.obj_id, pose.T_cam_obj) for pose in poses]
 
 
