@@ -59,8 +59,10 @@ SUSPICIOUS_M = 0.01
 @click.option("--object", "objects", type=int, multiple=True, help="Track only this object. Repeatable. [all]")
 @iterations_option
 @click.option("--motion-model", is_flag=True, help="Expect constant velocity, not the place of the last frame.")
-@click.option("--sure", type=click.FloatRange(0, 1), help="Confidence of a pose that fits. [0.35, learned 0.5]")
-@click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.2]")
+@click.option(
+    "--sure", type=click.FloatRange(0, 1), help="Confidence of a pose that fits. [0.35, learned 0.5, search 0.4]"
+)
+@click.option("--found", type=click.FloatRange(0, 1), help="Confidence of a pose that is believed. [0.2, search 0.4]")
 @click.option("--patience", type=click.IntRange(1), default=5, help="Frames without a pose until an object is lost.")
 @click.option(
     "--depth-step", type=click.FloatRange(0, 0.5, max_open=True),
