@@ -523,7 +523,7 @@ def test_what_was_finished_is_written_when_something_ends_it(cli, bop, trained, 
     interrupted.at = 1
     result = cli("refine", *rest)
     assert (result.exit_code, out.read_bytes()) == (130, before)
-    assert "nothing was written" in result.stderr
+    assert "Stopped: nothing was finished, nothing is written" in result.stderr
 
 
 @pytest.mark.parametrize(

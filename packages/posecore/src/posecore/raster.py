@@ -185,7 +185,8 @@ def _drawing(
     @wraps(method)
     def wrapped(self: "Rasteriser", *args: P.args, **settings: P.kwargs) -> R:
         with self._device.current():
-            return method(self, *args, **settings)
+            result: R = method(self, *args, **settings)
+        return result
 
     return wrapped
 

@@ -29,10 +29,12 @@ def stoppable(where: Path) -> Iterator[None]:
         raise SystemExit(130) from None
 
 
-def end_early(stopped: BaseException, line: str) -> NoReturn:
-    """End with one line, after what was finished was written: an interruption with exit code 130, or the error."""
-    click.echo(line, err=True)
-    if isinstance(stopped, KeyboardInterrupt):
+def end_early(stopped: BaseException, kept: str | None) -> NoReturn:
+    """End an interruption with exit code 130, or with the error; one line before it says what was kept, if anything."""
+    is_interrupted = isinstance(stopped, KeyboardInterrupt)
+    if kept is not None or is_interrupted:
+        click.echo(f"Stopped: {kept or 'nothing was finished, nothing is written'}", err=True)
+    if is_interrupted:
         raise SystemExit(130)
     raise stopped
 

@@ -159,7 +159,7 @@ def refine(
     finally:
         refiner.close()
     if stopped is not None and not result.done:
-        end_early(stopped, "Stopped before the first image was done: nothing was written")
+        end_early(stopped, None)
     sidecar = make_sidecar(
         dataset=bop, method=refiner, name=name or refiner.name, loaded=loaded, start_path=init,
         start_sidecar=start_sidecar, refined=result,
@@ -184,4 +184,4 @@ def refine(
         + (f" ({'start poses kept' if keep_failed else 'left out of the file'})" if result.failures else "")
     )
     if stopped is not None:
-        end_early(stopped, f"Stopped: {left} start poses were not reached, {out} holds the others")
+        end_early(stopped, f"{left} start poses were not reached, {out} holds the others")

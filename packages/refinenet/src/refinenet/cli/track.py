@@ -176,7 +176,7 @@ def track(
         except (KeyboardInterrupt, PoseError, OSError) as error:
             stopped = error
     if stopped is not None and not log.frames:
-        end_early(stopped, "Stopped before the first frame was done: nothing was written")
+        end_early(stopped, None)
     sidecar: dict[str, Any] = {"method": name or f"{refiner.name}, tracking"}
     if isinstance(sequence, BopScene):
         sidecar |= {"dataset": str(sequence.dataset.root.resolve()), "split": sequence.dataset.split}
@@ -203,7 +203,7 @@ def track(
     for why, count in Counter(miss["why"] for miss in log.misses).most_common(SHOWN_REASONS):
         click.echo(f"No pose, {count} times: {why}", err=True)
     if stopped is not None:
-        end_early(stopped, f"Stopped; what was tracked is in {out}")
+        end_early(stopped, f"what was tracked is in {out}")
 
 
 class _Starts:
