@@ -27,8 +27,9 @@ from posecore.mesh import load_mesh, save_ply
 from posecore.raster import Instance, Rasteriser
 from posecore.symmetry import ContinuousSymmetry
 from refinenet import checkpoint
+from refinenet.baselines.search import GradientSearch
 from refinenet.config import load_config
-from refinenet.methods import make_baseline
+from refinenet.methods import Refinement, Status, make_baseline
 from refinenet.network import make_network
 from refinenet.sequence import FileCamera, ImageFolder, VideoFile, VideoWriter
 
@@ -164,6 +165,21 @@ def test_a_baseline_tracks_without_a_checkpoint(cli, scene, tmp_path, method):
     assert sidecar["method"] == f"{method}, tracking"
     assert "checkpoint" not in sidecar
     assert sidecar["settings"]["depth_step"] == 0
+
+
+def test_search_is_believed_where_it_does_not_fail(cli, scene, tmp_path, monkeypatch):
+    def found(self, frame, T_cam_obj, target):
+        return Refinement(T_cam_obj=T_cam_obj, status=Status.STOPPED, iterations=1, confidence=0.42)
+
+    monkeypatch.setattr(GradientSearch, "_refine", found)
+    root, _ = scene
+    out = tmp_path / "track.csv"
+    result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert read_sidecar(out)["states"]["tracking"] == FRAMES
+    result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--sure", 0.5)
+    assert read_sidecar(out)["states"]["lost"] == FRAMES
+    assert "No pose, 3 times: the best pose has a confidence of 0.42" in result.stderr
 
 
 @pytest.mark.parametrize(
