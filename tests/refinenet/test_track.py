@@ -135,9 +135,12 @@ def test_a_folder_and_a_video_give_the_scenes_poses(cli, scene, still, mesh, tmp
     for file in sorted(folder.iterdir()):
         writer.write(cv2.imread(str(file)))
     writer.release()
-    save_ply(mesh, tmp_path / "part.ply", units="mm")
+    save_ply(mesh, tmp_path / "part.ply", units="m")
     (tmp_path / "models_info.json").write_text('{"part": {"diameter": 100.0}, "other": {"diameter": -1}}')
     rest = ["--camera", root / "cam.json", "--mesh", tmp_path / "part.ply", "--pose", root / "pose.json"]
+    options = ["--checkpoint", still, "--out", tmp_path / "x.csv"]
+    assert "--units m " in cli("track", folder, *rest, *options).stderr
+    rest += ["--units", "m"]
     for source in (folder, tmp_path / "clip.avi"):
         out = tmp_path / f"{source.name}.csv"
         result = cli("track", source, "--checkpoint", still, *rest, "--out", out, "--quiet", "--motion-model")

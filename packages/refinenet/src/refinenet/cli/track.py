@@ -28,7 +28,7 @@ from refinenet.cli.options import (
 if TYPE_CHECKING:
     import numpy as np
     from posecore.bop import ModelInfo
-    from posecore.mesh import Mesh
+    from posecore.mesh import Mesh, Units
 
     from refinenet.checkpoint import Checkpoint
     from refinenet.sequence import FrameSequence
@@ -54,8 +54,9 @@ SUSPICIOUS_M = 0.01
 @click.option("--camera", type=FILE, metavar="JSON", help="Camera of images or a video: a BOP camera.json.")
 @click.option(
     "--mesh", "mesh_files", type=FILE, multiple=True, metavar="FILE",
-    help="Mesh (mm) for images or a video; obj_000005.ply is object 5, else the only one known. Repeatable.",
+    help="Mesh for images or a video; obj_000005.ply is object 5, else the only one known. Repeatable.",
 )  # fmt: skip
+@click.option("--units", type=click.Choice(["mm", "cm", "m"]), default="mm", help="Unit of --mesh.")
 @click.option("--object", "objects", type=int, multiple=True, help="Track only this object. Repeatable. [all]")
 @iterations_option
 @click.option("--motion-model", is_flag=True, help="Expect constant velocity, not the place of the last frame.")
@@ -88,6 +89,7 @@ def track(
     scene: int | None,
     camera: Path | None,
     mesh_files: tuple[Path, ...],
+    units: "Units",
     objects: tuple[int, ...],
     iterations: int,
     motion_model: bool,
@@ -147,7 +149,7 @@ def track(
     loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     sequence = open_sequence(source, split=split, scene=scene, camera=camera)
     starts = _Starts(init, pose, sequence, objects)
-    meshes, infos = _models(sequence, mesh_files, loaded, starts.obj_ids)
+    meshes, infos = _models(sequence, mesh_files, units, loaded, starts.obj_ids)
     for path in filter(None, (out, video)):
         require_writable(path)
     log, stopped = TrackLog(), None
@@ -251,7 +253,7 @@ def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
 
 
 def _models(
-    sequence: "FrameSequence", files: tuple[Path, ...], loaded: "Checkpoint | None", obj_ids: list[int]
+    sequence: "FrameSequence", files: tuple[Path, ...], units: "Units", loaded: "Checkpoint | None", obj_ids: list[int]
 ) -> "tuple[dict[int, Mesh], dict[int, ModelInfo]]":
     """Meshes and symmetries of the objects: the dataset's, or files with a models_info.json beside them."""
     from posecore.bop.jsonfile import read_json
@@ -261,8 +263,10 @@ def _models(
     from refinenet.sequence import BopScene
 
     if isinstance(sequence, BopScene):
-        if files:
-            raise ConfigError("--mesh is for images and videos; a BOP dataset brings its own models")
+        if files or units != "mm":
+            raise ConfigError(
+                "--mesh and --units are for images and videos; a BOP dataset brings its own models, in mm"
+            )
         infos = sequence.dataset.models_info
         return {i: sequence.dataset.mesh(i) for i in obj_ids}, {i: infos[i] for i in obj_ids if i in infos}
     known = obj_ids if loaded is None else sorted(map(int, loaded.provenance.objects))
@@ -274,7 +278,7 @@ def _models(
             some, who = ", ".join(map(str, known)), "start poses are of" if loaded is None else "the checkpoint knows"
             raise ConfigError(f"{file}: {who} objects {some}; name the file obj_000001.ply to say which")
         obj_id = int(numbered[1]) if numbered else known[0]
-        meshes[obj_id] = load_mesh(file, units="mm")
+        meshes[obj_id] = load_mesh(file, units=units)
         info_file = file.with_name("models_info.json")
         listed = read_json(info_file) if info_file.is_file() else {}
         entry = listed.get(str(obj_id)) or listed.get(file.stem)  # by number as in BOP, or by the mesh's name
