@@ -42,6 +42,13 @@ def test_train_command(cli, dataset, tmp_path):
         (["--set", "loss.min_closeness=0.1"], 2, "which this network has not: set network.confidence=true"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
+        (["--set", "optimiser.lr=.inf"], 2, "lr is inf"),
+        (["--set", "optimiser.gradient_clip=-1"], 2, "gradient_clip is -1"),
+        (["--set", "network.encoder=[0, 4]"], 2, "encoder is (0, 4)"),
+        (["--set", "loss.contour_points=0"], 2, "contour_points is 0"),
+        (["--set", "loss.gamma=.nan"], 2, "gamma is nan"),
+        (["--set", "loader.prefetch=0"], 2, "prefetch is 0"),
+        (["--set", "seed=-1"], 2, "seed is -1"),
         (["--resume"], 1, "no run to resume"),
     ],
 )

@@ -56,7 +56,8 @@ def test_ranks_end_together_when_one_fails(dataset, tmp_path):
 
 
 def test_two_ranks_resume(dataset, tmp_path):
-    options = [*settings([*SMALL, "precision=float32", "optimiser.schedule=constant"])]
+    own = [f"own_predictions.{key}" for key in ("share=0.5", "begin=0", "full=0")]
+    options = [*settings([*SMALL, *own, "precision=float32", "optimiser.schedule=constant"])]
     assert torchrun(dataset, tmp_path / "whole", *options).returncode == 0
     first = [word.replace("steps=6", "steps=4") for word in options]
     assert torchrun(dataset, tmp_path / "parts", *first).returncode == 0

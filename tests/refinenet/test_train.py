@@ -167,11 +167,15 @@ def test_the_paper_preset_takes_a_step(mesh, tmp_path):
     from .conftest import make_dataset
 
     dataset = make_dataset(tmp_path / "shards", mesh, 8, 4, 224, contour_points=100)
-    config = load_config(
-        "paper",
-        ["backbone.pretrained=false", "batch=2", "loader.workers=0", "steps=1", "validation.pairs=2", "threads=1"],
-    )
+    options = ["backbone.pretrained=false", "batch=2", "loader.workers=0", "steps=1", "validation.pairs=2", "threads=1"]
+    config = load_config("paper", options)
     errors = train(config, str(dataset), tmp_path / "run")
     loaded = checkpoint.load(tmp_path / "run" / "best.safetensors", "paper")
     assert isinstance(loaded.network(), PaperNet)
     assert errors["validation/add_after_mm"] > 0
+    begun = load_config("paper", [*options[1:], f"init={loaded.path}"])  # which has a stem already
+    trainer = Trainer(begun, str(dataset), tmp_path / "begun", resume=False)
+    assert all(
+        torch.equal(value, loaded.network().state_dict()[key]) for key, value in trainer.kept.state_dict().items()
+    )
+    trainer.close()

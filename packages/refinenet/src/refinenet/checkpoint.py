@@ -196,9 +196,10 @@ def _state_path(folder: Path, step: int) -> Path:
 
 MAY_CHANGE = (
     "steps", "threads", "device", "compile", "log_every", "checkpoint_every", "validation.pairs", "validation.every",
-    "loader.skip_bad_shards", "loader.prefetch", "loader.cache_mb",
+    "loader.skip_bad_shards", "loader.prefetch", "loader.cache_mb", "init", "network.backbone.weights",
+    "network.backbone.pretrained",
 )  # fmt: skip
-"""Settings that a resumed run may change: they decide how long and where it runs, not what a step does.
+"""Settings that a resumed run may change: they decide how long and where it runs, or how it began.
 
 The share of scenes held out is none of them: with another one, scenes that were trained on would be measured on.
 """

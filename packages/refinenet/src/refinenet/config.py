@@ -1,5 +1,6 @@
 """Configuration of training and refinement; the presets are YAML files beside this module."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -15,6 +16,12 @@ PRESETS = ("paper", "compact", "plus", "flow")
 def _require(ok: bool, message: str) -> None:
     if not ok:
         raise ConfigError(message)
+
+
+def _require_finite(config: object, *names: str) -> None:
+    for name in names:
+        value = getattr(config, name)
+        _require(0 <= value < math.inf, f"{name} is {value}, expected a number of 0 or more")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +98,11 @@ class NetworkConfig:
             "rotation and translation are outputs of heads, which kind=flow does not have: leave both null",
         )
         _require(1 <= self.match_radius <= 16, f"match_radius is {self.match_radius}, expected 1 to 16 cells")
+        for name in ("branch_channels", "match_channels", "appearance_channels", "hidden"):
+            _require(getattr(self, name) >= 1, f"{name} is {getattr(self, name)}, expected 1 or more")
+        for name in ("encoder", "widths"):
+            _require(min(getattr(self, name)) >= 1, f"{name} is {getattr(self, name)}, expected 1 or more channels")
+        _require_finite(self, "head_std")
 
     @property
     def sees_depth(self) -> bool:
@@ -188,6 +200,7 @@ class AugmentConfig:
         for name in ("gain", "scene_gain", "brightness", "contrast"):
             value = getattr(self, name)
             _require(0 <= value < 1, f"{name} is {value}, expected 0 to under 1")
+        _require_finite(self, "noise")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -247,6 +260,12 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_closeness < 1, f"min_closeness is {self.min_closeness}, expected 0 to under 1")
+        _require_finite(self, "gamma", "point_weight", "rotation_weight", "confidence_weight")
+        for name in ("contour_points", "model_points"):
+            _require(getattr(self, name) >= 1, f"{name} is {getattr(self, name)}, expected 1 or more")
+        _require(
+            0 < self.symmetry_step_deg <= 180, f"symmetry_step_deg is {self.symmetry_step_deg}, expected up to 180"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,7 +294,8 @@ class OptimiserConfig:
     ema_decay: float = 0.0
 
     def __post_init__(self) -> None:
-        _require(self.lr > 0, f"lr is {self.lr}, expected a positive number")
+        _require(0 < self.lr < math.inf, f"lr is {self.lr}, expected a positive number")
+        _require_finite(self, "weight_decay", "gradient_clip", "warmup_steps")
         _require(self.accumulate >= 1, f"accumulate is {self.accumulate}, expected 1 or more")
         _require(0 <= self.ema_decay < 1, f"ema_decay is {self.ema_decay}, expected 0 to under 1")
 
@@ -302,6 +322,7 @@ class LoaderConfig:
 
     def __post_init__(self) -> None:
         _require(self.workers >= 0, f"workers is {self.workers}, expected 0 or more")
+        _require(self.prefetch >= 1, f"prefetch is {self.prefetch}, expected 1 or more")
         _require(self.cache_mb >= 0, f"cache_mb is {self.cache_mb}, expected 0 or more")
         _require(self.shuffle_shards >= 1, f"shuffle_shards is {self.shuffle_shards}, expected 1 or more")
 
@@ -379,6 +400,7 @@ class TrainConfig:
     checkpoint_every: int = 500
 
     def __post_init__(self) -> None:
+        _require_finite(self, "seed", "threads")
         for name in ("batch", "steps", "log_every", "checkpoint_every"):
             value = getattr(self, name)
             _require(value >= 1, f"{name} is {value}, expected 1 or more")

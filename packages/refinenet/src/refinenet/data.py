@@ -5,8 +5,12 @@ run resumes in the middle of an epoch by arithmetic, and a pair's pose does not 
 """
 
 import itertools
+import multiprocessing.util
 import os
+import signal
+import threading
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -305,6 +309,21 @@ def prepare_worker(threads: int = 1) -> None:
 
 def _init_worker(_: int) -> None:
     prepare_worker()
+    # a thread that still hands over a batch when Python ends would abort the process, and the run with a traceback
+    multiprocessing.util.Finalize(None, os._exit, args=(0,), exitpriority=-100)
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes started in here leave Ctrl-C to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 class _Loader(DataLoader[Batch]):
@@ -312,7 +331,9 @@ class _Loader(DataLoader[Batch]):
 
     def __iter__(self) -> Any:
         try:
-            yield from super().__iter__()
+            with _without_interrupts():
+                batches = super().__iter__()
+            yield from batches
         except PoseError as error:
             *wrapped, last = str(error).strip().splitlines()
             raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None

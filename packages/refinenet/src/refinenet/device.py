@@ -10,10 +10,13 @@ def choose_device(name: str) -> torch.device:
     """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
 
     Raises:
-        ConfigError: A GPU is asked for and there is none.
+        ConfigError: A GPU is asked for and there is none, or fewer than local ranks.
     """
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+    rank, count = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()
+    if rank >= count:
+        raise ConfigError(f"local rank {rank} has no GPU, there are {count} here; start --nproc-per-node {count}")
+    return torch.device("cuda", rank)

@@ -40,7 +40,9 @@ FOLLOW_POLL_S = 2.0
 def use_bfloat16(precision: str, device: torch.device) -> bool:
     """Whether convolutions run in bfloat16; on a processor without such instructions they would run slower in it."""
     if precision == "auto":
-        return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
+        if device.type == "cuda":
+            return torch.cuda.is_bf16_supported(including_emulation=False)
+        return torch.cpu._is_avx512_bf16_supported()
     return precision == "bfloat16"
 
 
@@ -115,7 +117,12 @@ class Trainer:
         self._optimiser = make_optimiser(self.network, config.optimiser)
         self._guard = FiniteGuard(self._optimiser, self.device, late=self.device.type == "cuda")
         self.step, self.best_mm = 0, math.inf
-        if last is None and isinstance(self.network, PaperNet) and config.network.backbone.pretrained:
+        if (
+            last is None
+            and not config.init
+            and isinstance(self.network, PaperNet)
+            and config.network.backbone.pretrained
+        ):
             stem = config.network.backbone
             backbone.load_pretrained(self.network.stem, stem.name, stem.weights)
         if last is None and config.init:
@@ -131,6 +138,12 @@ class Trainer:
     def kept(self) -> nn.Module:
         """The network that is measured and saved: the running average where there is one."""
         return self.network if self._average is None else self._average.network
+
+    def _share_buffers(self) -> None:
+        """Rank 0's batch norm statistics on every rank, before own predictions: a resumed run begins with those."""
+        if self.world > 1 and self.config.own_predictions.share:
+            for buffer in self.network.buffers():
+                torch.distributed.broadcast(buffer, src=0)
 
     def _last(self) -> checkpoint.Checkpoint:
         last = checkpoint.load(self.out / "last.safetensors", self.config.preset)
@@ -234,6 +247,7 @@ class Trainer:
         losses = []
         for i, batch in enumerate(batches):
             self._tell_skipped(*batch.skipped)
+            self._share_buffers()
             batch = self._own_predictions(self.network, batch.to(self.device), self.step, i)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
