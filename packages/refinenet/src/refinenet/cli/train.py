@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
     "--object", "objects", type=int, multiple=True, metavar="ID", help="Train on this object only. Repeatable. [all]"
 )
 @click.option("--steps", type=click.IntRange(1), help="Optimiser steps. [preset]")
-@click.option("--batch", type=click.IntRange(1), help="Pairs in a step. [preset]")
+@click.option("--batch", type=click.IntRange(1), help="Pairs in a batch, on each rank. [preset]")
 @click.option("--loss", type=click.Choice(LOSSES), help="Loss. [preset]")
 @click.option("--seed", type=click.IntRange(0), help="Of weights, order, hypotheses, augmentation. [preset, 0]")
 @click.option("--workers", type=click.IntRange(0), help="Loader processes; 0 loads in the training process. [preset]")
