@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from refinenet.sequence import FrameSequence
 
 SHOWN_REASONS = 3
-SUSPICIOUS_M = 0.01
-"""An object nearer than this was given in another unit."""
 
 
 @click.command()
@@ -241,6 +239,8 @@ class _Starts:
 def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
     from posecore.bop.annotations import ground_truth
     from posecore.bop.jsonfile import read_json
+
+    from refinenet.views import SUSPICIOUS_M
 
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
     nearest_m = min((abs(float(pose.T_cam_obj[2, 3])) for pose in poses), default=SUSPICIOUS_M)
