@@ -7,10 +7,7 @@ run resumes in the middle of an epoch by arithmetic, and a pair's pose does not 
 import itertools
 import multiprocessing.util
 import os
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -19,6 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from posecore.errors import ConfigError, PoseError, ShardError
+from posecore.interrupts import interrupts_ignored
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, load_meshes
 from torch import Tensor
@@ -313,25 +311,12 @@ def _init_worker(_: int) -> None:
     multiprocessing.util.Finalize(None, os._exit, args=(0,), exitpriority=-100)
 
 
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes started in here leave Ctrl-C to this one."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-
-
 class _Loader(DataLoader[Batch]):
     """A loader whose processes' errors arrive as they were raised, not wrapped with a traceback into the message."""
 
     def __iter__(self) -> Any:
         try:
-            with _without_interrupts():
+            with interrupts_ignored():
                 batches = super().__iter__()
             yield from batches
         except PoseError as error:

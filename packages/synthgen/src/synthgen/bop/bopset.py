@@ -26,6 +26,7 @@ from posecore.bop import (
 )
 from posecore.errors import ConfigError, DatasetError, RenderError
 from posecore.files import storage_error, write_atomic
+from posecore.interrupts import interrupts_ignored
 from posecore.mesh import Mesh
 
 from synthgen.assets import Assets
@@ -294,7 +295,7 @@ class Pool:
                 initializer=_start,
                 initargs=(self._job,),
             )
-            with processes.interrupts_ignored():  # a terminal sends ctrl-C to all; only this process may stop the run
+            with interrupts_ignored():  # a terminal sends ctrl-C to all; only this process may stop the run
                 for _ in range(self._workers):
                     self._executor.submit(os.getpid)
         return self._executor

@@ -9,8 +9,7 @@ import dask
 from distributed import Client, LocalCluster, Nanny
 from distributed.system import MEMORY_LIMIT
 from posecore.errors import RenderError
-
-from synthgen.run.processes import interrupts_ignored
+from posecore.interrupts import interrupts_ignored
 
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
 SETTINGS = {

@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -38,22 +37,6 @@ def forget_blenders_paths() -> None:
     inherits the path would import that one.
     """
     sys.path[:] = [entry for entry in sys.path if not (Path(entry) / "bpy_types.py").is_file()]
-
-
-@contextmanager
-def interrupts_ignored() -> Iterator[None]:
-    """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
-
-    A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
-    """
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may set signal handlers
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def behave_as_worker() -> None:
