@@ -65,6 +65,17 @@ def test_mask_is_the_hull_of_the_projected_corners(rasteriser: Rasteriser) -> No
         np.testing.assert_array_equal(mask[clear], outside_px[clear] < 0)
 
 
+def test_a_batch_of_several_objects_equals_renders_of_each(rasteriser: Rasteriser) -> None:
+    T, obj_ids = poses(6), np.array([2, 1, 1, 2, 1, 2])
+    batch = rasteriser.render(obj_ids, K, T, 64, 64, rgb=False)
+    for i, obj_id in enumerate(obj_ids):
+        single = rasteriser.render(int(obj_id), K, T[i : i + 1], 64, 64, rgb=False)
+        assert (batch.mask[i] != single.mask[0]).sum() <= 1
+        both = batch.mask[i] & single.mask[0]
+        assert both.any()
+        np.testing.assert_allclose(batch.depth_m[i][both], single.depth_m[0][both], atol=2e-6)
+
+
 def test_batch_with_one_K_per_pose_equals_single_renders(rasteriser: Rasteriser) -> None:
     T, rng = poses(7), np.random.default_rng(3)
     Ks = np.stack([camera.intrinsics(*rng.uniform(200, 300, 2), *rng.uniform(25, 40, 2)) for _ in T])

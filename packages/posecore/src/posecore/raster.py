@@ -277,7 +277,7 @@ class Rasteriser:
     @_drawing
     def render(
         self,
-        obj_id: int,
+        obj_id: int | Int[Array, " b"],
         K: Float[Array, "*k 3 3"],
         T_cam_obj: Float[Array, "b 4 4"],
         width_px: int,
@@ -286,10 +286,10 @@ class Rasteriser:
         rgb: bool = True,
         shading: Shading = HEADLIGHT,
     ) -> Layers:
-        """Draw one object at a batch of poses, each in an image of its own.
+        """Draw a batch of poses, each in an image of its own.
 
         Args:
-            obj_id: Which mesh.
+            obj_id: Which mesh, one for all or one per pose.
             K: One camera matrix for all, or one per pose (as crops have).
             T_cam_obj: Poses, metres.
             width_px: Width of each image.
@@ -299,6 +299,7 @@ class Rasteriser:
         """
         n = len(T_cam_obj)
         K = np.broadcast_to(np.asarray(K, np.float64), (n, 3, 3))
+        obj_ids = np.broadcast_to(obj_id, n)
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
         depth = np.empty((n, height_px, width_px), np.float32)
         columns = max(1, ATLAS_SIDE_PX // width_px)
@@ -313,7 +314,7 @@ class Rasteriser:
             for i in range(start, stop):
                 row, column = divmod(i - start, used_columns)
                 target.viewport = (column * width_px, row * height_px, width_px, height_px)
-                instance = Instance(obj_id=obj_id, T_cam_obj=T_cam_obj[i])
+                instance = Instance(obj_id=int(obj_ids[i]), T_cam_obj=T_cam_obj[i])
                 self._draw(instance, 0, K[i], width_px, height_px, near_m=self._near_m([instance]), rgb=rgb)
             size = (used_columns * width_px, used_rows * height_px)
             atlas_depth = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., :1]

@@ -151,7 +151,14 @@ class PairMaker:
             rngs: As many.
         """
         drafts = [d for i, (s, rng) in enumerate(zip(samples, rngs, strict=True)) if (d := self._draft(i, s, rng))]
-        rgb, depth = self._render(drafts)
+        if not drafts:
+            return None
+        K_crop = np.stack([d.K_crop for d in drafts])
+        guesses = np.stack([d.T_cam_obj_hypothesis for d in drafts])
+        obj_ids = np.array([int(d.sample["obj_id"]) for d in drafts])
+        layers = self._rasteriser.render(obj_ids, K_crop, guesses, self._patch_px, self._patch_px)
+        rgb, depth = layers.rgb, layers.depth_m
+        assert rgb is not None
         masks = [contour.contour_mask(d > 0) for d in depth]
         seen = [i for i, mask in enumerate(masks) if mask.sum() >= MIN_CONTOUR_PX]
         if not seen:
@@ -171,8 +178,8 @@ class PairMaker:
             scene_rgb=scene_rgb,
             hypothesis_rgb=hypothesis_rgb,
             T_cam_obj=np.stack([d.T_cam_obj for d in drafts]),
-            T_cam_obj_hypothesis=np.stack([d.T_cam_obj_hypothesis for d in drafts]),
-            K_crop=np.stack([d.K_crop for d in drafts]),
+            T_cam_obj_hypothesis=guesses[seen],
+            K_crop=K_crop[seen],
             scene_contour_m=np.stack([self._scene_points(d) for d in drafts]),
             hypothesis_contour_m=np.stack(points),
             scene_distance_px=np.stack([d.scene_distance_px for d in drafts]),
@@ -181,7 +188,7 @@ class PairMaker:
             scene_bits=scene_bits,
             overlap=visible_overlap(depth[seen] > 0, scene_bits),
             render_colours=render_colours,
-            obj_id=np.array([int(d.sample["obj_id"]) for d in drafts]),
+            obj_id=obj_ids[seen],
             kept=np.array([d.index for d in drafts]),
         )
 
@@ -230,18 +237,6 @@ class PairMaker:
         """One of the poses that look like the truth."""
         transforms = self._symmetries.get(obj_id)
         return truth if transforms is None else np.asarray(truth @ transforms[rng.integers(len(transforms))])
-
-    def _render(self, drafts: Sequence[_Draft]) -> tuple[UInt8[Array, "b p p 3"], Float[Array, "b p p"]]:
-        p = self._patch_px
-        rgb, depth = np.zeros((len(drafts), p, p, 3), np.uint8), np.zeros((len(drafts), p, p), np.float32)
-        ids = np.array([int(d.sample["obj_id"]) for d in drafts])
-        for obj_id in np.unique(ids):
-            rows = np.flatnonzero(ids == obj_id)
-            K = np.stack([drafts[i].K_crop for i in rows])
-            T = np.stack([drafts[i].T_cam_obj_hypothesis for i in rows])
-            layers = self._rasteriser.render(int(obj_id), K, T, p, p)
-            rgb[rows], depth[rows] = layers.rgb, layers.depth_m
-        return rgb, depth
 
     def _scene(
         self, draft: _Draft, samples: Sequence[Mapping[str, Any]], rng: np.random.Generator

@@ -160,7 +160,12 @@ class OwnPredictions:
         cut = [window for window in windows.values() if window is not None]
         patch_px = self._config.network.patch_px
         K_new = np.stack([crop_K(K[i], window, patch_px) for i, window in zip(drawn, cut, strict=True)])
-        rgb, depth = self._render(index[drawn], K_new, T[drawn])
+        if self._rasteriser is None:
+            self._rasteriser = Rasteriser(for_patches(self._meshes, patch_px))
+        obj_ids = np.array(self._obj_ids)[index[drawn]]
+        layers = self._rasteriser.render(obj_ids, K_new, T[drawn], patch_px, patch_px)
+        rgb, depth = layers.rgb, layers.depth_m
+        assert rgb is not None
         uv = _grid(cut, patch_px).to(K_crop.device)
         bits = _resampled(target.scene_bits[torch.from_numpy(drawn).to(uv.device), None].float(), uv, "nearest")[:, 0]
         host_bits = bits.byte().cpu().numpy()
@@ -214,19 +219,6 @@ class OwnPredictions:
         if not patch_px / FARTHEST_SIDE < window.side_px < patch_px * FARTHEST_SIDE or apart > patch_px:
             return None
         return window
-
-    def _render(
-        self, index: Int[Array, " s"], K: Float[Array, "s 3 3"], T: Float[Array, "s 4 4"]
-    ) -> tuple[UInt8[Array, "s p p 3"], Float[Array, "s p p"]]:
-        if self._rasteriser is None:
-            self._rasteriser = Rasteriser(for_patches(self._meshes, self._config.network.patch_px))
-        p = self._config.network.patch_px
-        rgb, depth = np.zeros((len(T), p, p, 3), np.uint8), np.zeros((len(T), p, p), np.float32)
-        for i in np.unique(index):
-            rows = np.flatnonzero(index == i)
-            layers = self._rasteriser.render(self._obj_ids[i], K[rows], T[rows], p, p)
-            rgb[rows], depth[rows] = layers.rgb, layers.depth_m
-        return rgb, depth
 
 
 def _tinted(rgb: UInt8[Array, "s p p 3"], colours: Float[Tensor, "s 3 3"] | None) -> UInt8[Tensor, "s 3 p p"]:

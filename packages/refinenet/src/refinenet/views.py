@@ -91,10 +91,10 @@ class Viewer:
         rgb, depth_m = np.zeros((b, p, p, 3), np.uint8), np.zeros((b, p, p), np.float32)
         inside = np.zeros((b, p, p), bool)
         drawable = np.array(sorted(windows), np.int64)
-        for i in np.unique(obj_id[drawable]):
-            rows = drawable[obj_id[drawable] == i]
-            layers = self._rasteriser.render(int(i), np.stack([K_crop[int(r)] for r in rows]), T_cam_obj[rows], p, p)
-            rgb[rows], depth_m[rows] = layers.rgb, layers.depth_m
+        if len(drawable):
+            cameras = np.stack([K_crop[int(r)] for r in drawable])
+            layers = self._rasteriser.render(obj_id[drawable], cameras, T_cam_obj[drawable], p, p)
+            rgb[drawable], depth_m[drawable] = layers.rgb, layers.depth_m
         for row, window in windows.items():
             inside[row] = pixels_inside(window, p, width_px, height_px)
             if not (depth_m[row] > 0).any():

@@ -177,9 +177,8 @@ class Batch:
             raise RenderError("this batch has no rasteriser, so nothing can be drawn again")
         p = self.facts.patch_px
         depth_m = np.zeros((len(self), p, p), np.float32)
-        for obj_id in np.unique(self["obj_id"]).tolist():
-            rows = np.flatnonzero(self["obj_id"] == obj_id)
-            if obj_id in self.facts.meshes:
-                K, T = self["K_crop"][rows], self[pose][rows]
-                depth_m[rows] = self._rasteriser.render(obj_id, K, T, p, p, rgb=False).depth_m
+        rows = np.flatnonzero(np.isin(self["obj_id"], list(self.facts.meshes)))
+        if len(rows):
+            K, T = self["K_crop"][rows], self[pose][rows]
+            depth_m[rows] = self._rasteriser.render(self["obj_id"][rows], K, T, p, p, rgb=False).depth_m
         return depth_m
