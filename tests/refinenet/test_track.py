@@ -266,6 +266,7 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
         ([root, *init, *camera], 2, "--camera is for images and videos"),
+        ([root, *init, "--fps", 10], 2, "--fps does nothing without --video: leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
         ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 looks like metres"),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
@@ -279,6 +280,8 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         assert len([line for line in result.stderr.splitlines() if line.startswith("Error: ")]) == 1
     assert cli("track", root, "--checkpoint", still, "--out", tmp_path / "x.csv").exit_code == 2
     assert "needs a --checkpoint" in cli("track", root, *init, "--out", tmp_path / "x.csv").stderr
+    edges = ["--method", "edge-icp", "--allow-other-mesh", "--out", tmp_path / "x.csv"]
+    assert "--allow-other-mesh does nothing without a --checkpoint" in cli("track", root, *init, *edges).stderr
 
 
 def test_depth_for_a_method_that_needs_it(cli, scene, mesh, tmp_path):

@@ -444,4 +444,33 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
         mapping = posecore_config.merge(mapping, posecore_config.load_yaml(file))
         where = str(file)
     full = [f"network.{item}" if item.startswith("backbone.") else item for item in overrides]
-    return posecore_config.build(TrainConfig, posecore_config.apply_overrides(mapping, full), where)
+    config = posecore_config.build(TrainConfig, posecore_config.apply_overrides(mapping, full), where)
+    _require_used(config, [item.partition("=")[0] for item in full])
+    return config
+
+
+def _require_used(config: TrainConfig, keys: Sequence[str]) -> None:
+    """Refuse keys that someone set by hand and that change nothing under the rest of the configuration.
+
+    Raises:
+        ConfigError: There is one; it and what it needs are named.
+    """
+    loss, stem = config.loss.name, "network.kind=paper"
+    drawn = ("max_angle_deg", "max_translation_diameter", "depth_stretch", "easy_share", "any_twin", "in_plane")
+    unused = {
+        "hypothesis.fresh=true": [] if config.hypothesis.fresh else [f"hypothesis.{name}" for name in drawn],
+        stem: [] if config.network.kind == "paper" else ["network.backbone.", "network.branch_channels"],
+        "window.kind=diameter": [] if config.window.kind == "diameter" else ["window.scale"],
+        "loss.name=mse": [] if loss == "mse" else ["loss.gamma"],
+        "a loss with point in its name": [] if "point" in loss else ["loss.rotation_weight", "loss.model_points"],
+        "loss.name=contour+point": [] if "+point" in loss else ["loss.point_weight"],
+        "network.confidence=true": [] if config.network.confidence else ["loss.confidence_"],
+        "own_predictions.share above 0": [] if config.own_predictions.share else ["own_predictions."],
+        "loader.workers above 0": [] if config.loader.workers else ["loader.prefetch"],
+    }
+    for needed, names in unused.items():
+        for key in keys:
+            _require(
+                not key.startswith(tuple(names)) or key == "own_predictions.share",
+                f"{key} changes nothing here: it needs {needed}; leave it out, or set that as well",
+            )

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import click
+from click.core import ParameterSource
 
 from refinenet.methods import BASELINES, NETWORK
 
@@ -45,8 +46,22 @@ def require_apart(read: Mapping[str, Path | None], written: Mapping[str, Path | 
             raise click.UsageError(f"{name} and {other} are both {path}: name two files")
 
 
+def require_used(needs: str, *names: str) -> None:
+    """Refuse options of this command that were given and would do nothing, for what they need is not there."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        given = context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
+        if option.name in names and given:
+            raise click.UsageError(f"{option.opts[-1]} does nothing without {needs}: leave it out")
+
+
 def require_fit(method: str, checkpoint: Path | None, with_network: Sequence[str] = ()) -> None:
-    """Refuse a network without a checkpoint, and a baseline with one that is not among `with_network`."""
+    """Refuse a network without a checkpoint, and a baseline with one that is not among `with_network`.
+
+    Also options of a network where there is none.
+    """
     if (checkpoint is None) == (method == NETWORK) and method not in with_network:
         needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
         raise click.UsageError(f"--method {method} {needs}")
+    if checkpoint is None:
+        require_used("a --checkpoint", "device", "batch", "allow_other_mesh")

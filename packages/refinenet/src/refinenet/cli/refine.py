@@ -18,6 +18,7 @@ from refinenet.cli.options import (
     quiet_option,
     require_apart,
     require_fit,
+    require_used,
     threads_option,
     verbose_option,
 )
@@ -108,6 +109,8 @@ def refine(
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
+    if hypotheses == 1:
+        require_used("--hypotheses above 1", "scorer", "seed")
     if min_confidence is not None and method not in WITH_CONFIDENCE:
         raise click.UsageError(
             f"--min-confidence is for --method {' and '.join(WITH_CONFIDENCE)}, {method} tells no confidence"

@@ -21,6 +21,7 @@ from refinenet.cli.options import (
     quiet_option,
     require_apart,
     require_fit,
+    require_used,
     threads_option,
     verbose_option,
 )
@@ -117,6 +118,8 @@ def track(
     """
     start_logging(verbose)
     require_fit(method, checkpoint)
+    if video is None:
+        require_used("--video", "fps")
     if (init is None) == (pose is None):
         raise click.UsageError("give either --init or --pose: where the objects are at the start")
     require_apart(

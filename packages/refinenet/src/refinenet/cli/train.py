@@ -137,7 +137,7 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
                 )
                 bar.console.print(f"step {step}  {move}", highlight=False, soft_wrap=True)
             return
-        loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss_"))
+        loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss"))
         wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_share']:.0f} %)"
         timing = f"{wait}, compute {values['compute_ms']:.0f} ms, {values['pairs_per_s']:.0f} pairs/s"
         bad = f"  {values['skipped_shards']:.0f} bad shards" if values["skipped_shards"] else ""
