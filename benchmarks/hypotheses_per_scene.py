@@ -20,8 +20,9 @@ import numpy as np
 from posecore.shard import load_meshes
 from refinenet import checkpoint, metrics
 from refinenet.config import TrainConfig, load_config
-from refinenet.data import PairSource, validation_batches
+from refinenet.data import PairSource
 from refinenet.device import choose_device
+from refinenet.held_out import validation_batches
 from refinenet.loss import ObjectPoints
 from refinenet.objects import load_models, object_points
 from refinenet.split import Split, spread_rows

@@ -6,14 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from posecore import contour, se3
+from posecore.bop import BopWriter, Estimate, GroundTruth, write_models, write_results
 from posecore.bop.models_info import save_models_info
-from posecore.camera import crop_K, intrinsics
+from posecore.camera import Camera, crop_K, intrinsics
 from posecore.mesh import Mesh, load_mesh, save_ply
 from posecore.raster import Rasteriser
 from posecore.shard import ShardWriter
 from posecore.window import cut, fixed_side_px, fixed_window
+from refinenet import checkpoint
+from refinenet.config import load_config
+from refinenet.network import make_network
 
 K = intrinsics(572.4, 573.6, 325.3, 242.0)
 WIDTH_PX, HEIGHT_PX = 640, 480
@@ -130,6 +135,67 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Mesh:
 def dataset(tmp_path_factory: pytest.TempPathFactory, mesh: Mesh) -> Path:
     """48 pairs in 6 shards of 64 px patches."""
     return make_dataset(tmp_path_factory.mktemp("data") / "shards", mesh, 48, 8, 64)
+
+
+@pytest.fixture(scope="session")
+def frame(mesh):
+    """An image with two instances, and their poses."""
+    rng = np.random.default_rng(0)
+    z = 6 * mesh.diameter_m
+    truths = np.stack([
+        se3.make_T(se3.random_rotation(rng), np.array([x * z, 0.05 * z, z])) for x in (-0.2, 0.22)
+    ])  # fmt: skip
+    image = background(rng)
+    with Rasteriser({1: mesh}) as rasteriser:
+        layers = rasteriser.render(1, K, truths, WIDTH_PX, HEIGHT_PX)
+    for rgb, mask in zip(layers.rgb, layers.mask, strict=True):
+        image[mask] = rgb[mask]
+    return image, truths
+
+
+@pytest.fixture(scope="session")
+def trained(mesh, tmp_path_factory):
+    """A checkpoint of random weights for object 1."""
+    torch.manual_seed(0)
+    config = load_config("compact")
+    path = tmp_path_factory.mktemp("checkpoint") / "random.safetensors"
+    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
+    provenance = checkpoint.Provenance(
+        config=config, step=7, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
+    )
+    checkpoint.save(path, make_network(config.network), provenance)
+    return path
+
+
+def starts_of(truths, mesh):
+    """Poses near true ones."""
+    rng = np.random.default_rng(1)
+    return np.stack([se3.perturb(T, np.deg2rad(20), 0.15 * mesh.diameter_m, rng) for T in truths])
+
+
+def make_bop(root, image, camera, truths, mesh):
+    """A BOP dataset of one image."""
+    with Rasteriser({1: mesh}) as rasteriser:
+        layers = rasteriser.render(1, camera.K, truths, camera.width_px, camera.height_px)
+    gts = [GroundTruth(obj_id=1, T_cam_obj=T, visib_fract=1.0, gt_index=i) for i, T in enumerate(truths)]
+    writer = BopWriter(root, "test", 1)
+    writer.add_frame(0, image, layers.depth_m.max(axis=0), camera, gts, list(layers.mask), list(layers.mask))
+    writer.close()
+    write_models(root, {1: mesh}, {})
+
+
+@pytest.fixture
+def bop(tmp_path, mesh, frame):
+    """A BOP dataset of that image, and start poses with a sidecar; one of them is behind the camera."""
+    image, truths = frame
+    root = tmp_path / "bop"
+    camera = Camera(K=K, width_px=WIDTH_PX, height_px=HEIGHT_PX)
+    make_bop(root, image, camera, truths, mesh)
+    starts = [*starts_of(truths, mesh), se3.make_T(np.eye(3), np.array([0, 0, -0.5]))]
+    estimates = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=T) for T in starts]
+    sidecar = {"dataset": str(root), "method": "start", "perturbation": {"rows": [{"line": 2}]}}
+    write_results(tmp_path / "start.csv", estimates, sidecar)
+    return root, tmp_path / "start.csv"
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
 from refinenet.checkpoint import load
-from refinenet.split import OTHER_OBJECT, DataRecord, Growth, divide, held_out_scenes, read_scenes
+from refinenet.growth import Growth
+from refinenet.split import OTHER_OBJECT, DataRecord, divide, held_out_scenes, read_scenes
 from refinenet.train import train
 from refinenet.trainer import Trainer
 
@@ -52,7 +53,7 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     run = Trainer(config, str(two_objects), tmp_path / "look")
     for batch in itertools.islice(run.stream(), 12):
         assert (batch.target.object_index == 1).all()
-    assert all((batch.target.object_index == 1).all() for batch in run._held_out)
+    assert all((batch.target.object_index == 1).all() for batch in run._held_out.batches)
     run.close()
     train(config, str(two_objects), tmp_path / "run")
     assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
@@ -66,7 +67,7 @@ def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
     # A run that began with two shards: the others join in its second epoch.
     (tmp_path / "grown").mkdir()
     record = DataRecord(shards=(0, 1), held_out=(0,))
-    growth = Growth(out=tmp_path / "grown", record=record, objects=(1,))
+    growth = Growth(out=tmp_path / "grown", record=record, config=config)
     joined = next(growth.epochs(str(two_objects)))
     reader = ShardReader(str(two_objects))
     assert set(joined) == {*reader.committed} - {0, 1}

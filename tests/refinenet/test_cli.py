@@ -6,8 +6,9 @@ import threading
 
 import pytest
 from posecore.shard import ShardReader
-from refinenet.split import split_by_scene
 from tensorboard.summary.writer.record_writer import RecordWriter
+
+from .test_data import split_by_scene
 
 SMALL = [
     "--steps", "2", "--batch", "4", "--workers", "0", "--threads", "1", "--set", "loss.contour_points=32",
@@ -41,6 +42,15 @@ def test_train_command(cli, dataset, tmp_path):
         (["--set", "hypothesis.fresh=false", "--set", "hypothesis.stored_share=0.5"], 2, "set hypothesis.fresh=true"),
         (["--set", "loss.min_closeness=0.1"], 2, "which this network has not: set network.confidence=true"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
+        (
+            ["--set", "hypothesis.fresh=false", "--set", "hypothesis.max_angle_deg=40"],
+            2,
+            "hypothesis.max_angle_deg changes nothing here: it needs hypothesis.fresh=true",
+        ),
+        (["--backbone-weights", "stem.safetensors"], 2, "network.backbone.weights changes nothing here"),
+        (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share above 0"),
+        (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
+        (["--set", "loader.prefetch=2"], 2, "it needs loader.workers above 0"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
         (["--set", "optimiser.lr=.inf"], 2, "lr is inf"),
         (["--set", "optimiser.gradient_clip=-1"], 2, "gradient_clip is -1"),

@@ -10,8 +10,9 @@ from posecore.errors import ConfigError, ShardError
 from posecore.shard import ShardReader
 from refinenet import geometry
 from refinenet.config import load_config
-from refinenet.data import PairStream, make_loader
-from refinenet.split import split_by_scene, spread_rows
+from refinenet.data import PairSource, PairStream, make_loader
+from refinenet.held_out import validation_batches
+from refinenet.split import divide, held_out_scenes, read_scenes, spread_rows
 
 SMALL = [
     "batch=4",
@@ -20,6 +21,12 @@ SMALL = [
     "loss.contour_points=32",
     "validation.scene_share=0.2",
 ]
+
+
+def split_by_scene(reader, share, seed):
+    """A dataset's samples for training and for validation."""
+    scene_of, _ = read_scenes(reader, reader.committed)
+    return divide(scene_of, held_out_scenes(reader.url, scene_of, share, seed))
 
 
 @pytest.fixture(scope="module")
@@ -150,3 +157,17 @@ def test_any_twin_takes_the_symmetries_that_the_dataset_carries(dataset, mesh, t
 
     assert turned_deg().max() < 11
     assert (turned_deg("hypothesis.any_twin=true") > 165).any()
+
+
+def test_held_out_pairs_of_many_shards_fill_batches_and_no_cache(dataset):
+    config = load_config("compact", [*SMALL, "loader.cache_mb=64", "hypothesis.fresh=false"])
+    validation = spread_rows(split_by_scene(ShardReader(str(dataset)), 0.5, 0)[1], 10)
+    assert len(validation.rows) > 3
+    source = PairSource(str(dataset), config, training=False)
+    batches = list(validation_batches(source, validation, 4))
+    assert [len(batch.sample_ids) for batch in batches] == [4, 4, 2]
+    assert torch.cat([batch.sample_ids for batch in batches]).tolist() == [
+        [shard, row] for shard, rows in sorted(validation.rows.items()) for row in rows
+    ]
+    assert not source._cache
+    source.close()

@@ -3,6 +3,7 @@
 import errno
 import itertools
 import json
+import logging
 import os
 import random
 import signal
@@ -85,6 +86,20 @@ def test_a_run_is_not_resumed_under_other_circumstances(undisturbed, dataset, tm
     with pytest.raises(CheckpointError, match=r"data.json: missing or damaged .*start a new run"):
         Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
     (undisturbed / "data.json").write_text(record)
+
+
+def test_a_cosine_rate_that_jumps_on_resume_is_said(dataset, tmp_path, caplog):
+    options = ["steps=4", "optimiser.warmup_steps=0"]
+    train(small(*options), str(dataset), tmp_path)
+    with caplog.at_level(logging.WARNING):
+        resumed = Trainer(small(*options, "steps=8"), str(dataset), tmp_path, resume=True)
+    assert "steps was 4 and is now 8, so the cosine rate jumps from 1e-05 to 0.000505" in caplog.text
+    values = resumed.take_step(next(resumed.stream()))
+    assert values["learning_rate"] == pytest.approx(0.000505)
+    resumed.close()
+    caplog.clear()
+    Trainer(small(*options), str(dataset), tmp_path, resume=True).close()
+    assert "jumps" not in caplog.text
 
 
 def test_what_a_killed_run_left_goes(undisturbed, dataset):

@@ -172,10 +172,14 @@ def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path)
 def test_every_switch_trains_alone(dataset, tmp_path, switch):
     stored = ["window.kind=fixed", "hypothesis.fresh=false", "network.confidence=true", "own_predictions.share=1"]
     switches = stored if switch == "stored pairs" else [switch]
-    trainer = Trainer(small("own_predictions.begin=0", "own_predictions.full=0", *switches), str(dataset), tmp_path)
+    if any("own_predictions" in each for each in switches):
+        switches += ["own_predictions.begin=0", "own_predictions.full=0"]
+    trainer = Trainer(small(*switches), str(dataset), tmp_path)
     try:
         values = trainer.take_step(next(trainer.stream()))
     finally:
         trainer.close()
     assert all(np.isfinite(float(value)) for value in values.values())
     assert 0 < float(values["visible_share"]) <= 1
+    # a confidence's cross-entropy and quaternions are no pixels
+    assert ("loss_px" in values) == (switch not in ("network.confidence=true", "loss.name=mse", "stored pairs"))

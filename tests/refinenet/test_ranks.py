@@ -43,6 +43,8 @@ def test_two_ranks_learn_what_one_process_learns_with_the_doubled_batch(dataset,
     two, one = (curve(tmp_path / name, "loss_px") for name in ("two", "one"))
     assert len(one) == 6
     assert two == pytest.approx(one, rel=1e-3)
+    shares = [curve(tmp_path / name, "visible_share") for name in ("two", "one")]
+    assert shares[0] == pytest.approx(shares[1], rel=1e-5)
     assert curve(tmp_path / "two", "gradient_norm") == pytest.approx(curve(tmp_path / "one", "gradient_norm"), rel=1e-2)
 
 

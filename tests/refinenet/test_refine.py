@@ -1,7 +1,4 @@
-import json
 import re
-import shutil
-import threading
 from dataclasses import replace
 
 import cv2
@@ -9,53 +6,19 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from posecore import raster, se3
-from posecore.bop import BopDataset, BopWriter, Estimate, read_results, read_sidecar, write_models, write_results
-from posecore.camera import Camera, project
+from posecore import se3
+from posecore.camera import project
 from posecore.errors import CameraError, CheckpointError
 from posecore.mesh import Mesh, load_mesh, mesh_digest, save_ply
-from posecore.raster import Rasteriser
 from posecore.window import Window, cut, cut_rgb, diameter_window
 from refinenet import checkpoint, geometry
-from refinenet.config import load_config
 from refinenet.errors import RefinementError
 from refinenet.geometry import PoseUpdate
 from refinenet.methods import Frame, Request, Status
-from refinenet.network import make_network
 from refinenet.pool import PooledRefiner
 from refinenet.refine import Refiner
 
-from .conftest import HEIGHT_PX, WIDTH_PX, K, background
-
-
-@pytest.fixture(scope="module")
-def frame(mesh):
-    """An image with two instances, and their poses."""
-    rng = np.random.default_rng(0)
-    z = 6 * mesh.diameter_m
-    truths = np.stack([
-        se3.make_T(se3.random_rotation(rng), np.array([x * z, 0.05 * z, z])) for x in (-0.2, 0.22)
-    ])  # fmt: skip
-    image = background(rng)
-    with Rasteriser({1: mesh}) as rasteriser:
-        layers = rasteriser.render(1, K, truths, WIDTH_PX, HEIGHT_PX)
-    for rgb, mask in zip(layers.rgb, layers.mask, strict=True):
-        image[mask] = rgb[mask]
-    return image, truths
-
-
-@pytest.fixture(scope="module")
-def trained(mesh, tmp_path_factory):
-    """A checkpoint of random weights for object 1."""
-    torch.manual_seed(0)
-    config = load_config("compact")
-    path = tmp_path_factory.mktemp("checkpoint") / "random.safetensors"
-    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
-    provenance = checkpoint.Provenance(
-        config=config, step=7, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
-    )
-    checkpoint.save(path, make_network(config.network), provenance)
-    return path
+from .conftest import HEIGHT_PX, WIDTH_PX, K, starts_of
 
 
 class Oracle(torch.nn.Module):
@@ -73,11 +36,6 @@ class Oracle(torch.nn.Module):
             dR, dt = se3.update_between(T, truth)
             updates.append((se3.rotation_from_rotvec(self.share * se3.rotvec_from_rotation(dR)), self.share * dt))
         return PoseUpdate(*(torch.from_numpy(np.stack(x)).float() for x in zip(*updates, strict=True)))
-
-
-def starts_of(truths, mesh):
-    rng = np.random.default_rng(1)
-    return np.stack([se3.perturb(T, np.deg2rad(20), 0.15 * mesh.diameter_m, rng) for T in truths])
 
 
 def requests_of(poses):
@@ -253,32 +211,6 @@ def test_confidence_is_the_networks_where_it_has_one_and_else_of_the_gradients(m
     assert result.confidence == pytest.approx(1 / (1 + np.exp(-2)), abs=0.01)
 
 
-def test_a_real_network_ranks_a_pool_by_its_own_confidence(cli, bop, mesh, frame, tmp_path):
-    """Through the command, on random weights: the scores in the file are what the network says of the poses there."""
-    torch.manual_seed(1)
-    config = load_config("compact", ["network.confidence=true", "network.head_std=0.05"])
-    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
-    provenance = checkpoint.Provenance(
-        config=config, step=1, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
-    )
-    path, out = tmp_path / "sure.safetensors", tmp_path / "pool.csv"
-    checkpoint.save(path, make_network(config.network), provenance)
-    root, start = bop
-    options = ["--hypotheses", 8, "--scorer", "learned", "--iterations", 1, "--threads", 1, "--quiet"]
-    result = cli("refine", "--checkpoint", path, "--dataset", root, "--init", start, "--out", out, *options)
-    assert result.exit_code == 0, result.output
-    settings = read_sidecar(out)["settings"]
-    assert (settings["scorer"], settings["confidence"], settings["hypotheses"]) == ("learned", "learned", 8)
-    found = read_results(out)
-    image, _ = frame
-    with Refiner.load(path, {1: mesh}) as refiner:
-        said = refiner.confidences(
-            Frame(image=image, K=K), [Request(obj_id=1, T_cam_obj=e.T_cam_obj) for e in found], "learned"
-        )
-    np.testing.assert_allclose([e.score for e in found], said, atol=2e-3)  # poses in files are rounded
-    assert len({round(float(value), 4) for value in said}) == len(found) > 1
-
-
 def test_a_pool_is_ranked_and_its_best_is_returned(mesh, trained, frame, monkeypatch):
     """With a network that leaves poses where they are, the pool alone must bring the pose nearer."""
     image, truths = frame
@@ -380,152 +312,6 @@ def save(mesh, path):
     return path
 
 
-def test_a_machine_without_egl_gets_one_line(cli, bop, trained, tmp_path, monkeypatch):
-    root, start = bop
-    monkeypatch.setattr(raster, "_threads", threading.local())
-
-    def no_device(**settings):
-        raise Exception("(standalone) XOpenDisplay: cannot open display")
-
-    monkeypatch.setattr(raster.moderngl, "create_context", no_device)
-    result = cli(
-        "refine", "--checkpoint", trained, "--dataset", root, "--init", start, "--out", tmp_path / "x.csv", "--quiet"
-    )
-    assert result.exit_code == 1
-    (line,) = result.stderr.splitlines()
-    assert "no EGL device for the rasteriser" in line
-    assert "libegl1" in line
-
-
-@pytest.fixture
-def bop(tmp_path, mesh, frame):
-    """A BOP dataset of that image, and start poses with a sidecar; one of them is behind the camera."""
-    image, truths = frame
-    root = tmp_path / "bop"
-    camera = Camera(K=K, width_px=WIDTH_PX, height_px=HEIGHT_PX)
-    make_bop(root, image, camera, truths, mesh)
-    starts = [*starts_of(truths, mesh), se3.make_T(np.eye(3), np.array([0, 0, -0.5]))]
-    estimates = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=T) for T in starts]
-    sidecar = {"dataset": str(root), "method": "start", "perturbation": {"rows": [{"line": 2}]}}
-    write_results(tmp_path / "start.csv", estimates, sidecar)
-    return root, tmp_path / "start.csv"
-
-
-def make_bop(root, image, camera, truths, mesh):
-    from posecore.bop import GroundTruth
-
-    with Rasteriser({1: mesh}) as rasteriser:
-        layers = rasteriser.render(1, camera.K, truths, camera.width_px, camera.height_px)
-    gts = [GroundTruth(obj_id=1, T_cam_obj=T, visib_fract=1.0, gt_index=i) for i, T in enumerate(truths)]
-    writer = BopWriter(root, "test", 1)
-    writer.add_frame(0, image, layers.depth_m.max(axis=0), camera, gts, list(layers.mask), list(layers.mask))
-    writer.close()
-    write_models(root, {1: mesh}, {})
-
-
-def test_refine_command(cli, bop, trained, tmp_path):
-    root, start = bop
-    out = tmp_path / "results" / "refined.csv"
-    arguments = [
-        "--checkpoint",
-        trained,
-        "--dataset",
-        root,
-        "--init",
-        start,
-        "--out",
-        out,
-        "--overlay",
-        tmp_path / "pics",
-    ]
-    result = cli("refine", *arguments, "--name", "mine", "--iterations", 2)
-    assert result.exit_code == 0, result.output
-    assert "3 start poses, 2 refined (0 converged), 1 failed (left out of the file)" in result.stdout
-    refined, starts = read_results(out, BopDataset(root)), read_results(start)
-    assert all(0 < e.score < 1 and e.score != 0.9 for e in refined)  # how well the pose fits
-    assert np.abs(refined[0].T_cam_obj - starts[0].T_cam_obj).max() > 1e-4
-    assert len({e.time_s for e in refined}) == 1
-    assert refined[0].time_s > 0
-    sidecar = read_sidecar(out)
-    assert sidecar["method"] == "mine"
-    assert sidecar["checkpoint_sha256"] == checkpoint.load(trained).sha256
-    assert sidecar["perturbation"] == {"rows": [{"line": 2}]}
-    assert sidecar["start_lines"] == [2, 3]
-    assert sidecar["failed_lines"] == [4]
-    assert "behind the camera" in sidecar["failures"]["4"]
-    assert f"Failed: {start}:4: scene 1, image 0, object 1: at z = " in result.stderr
-    picture = cv2.imread(str(tmp_path / "pics" / "000001_000000.png"))
-    assert picture.shape == (HEIGHT_PX, WIDTH_PX, 3)
-    result = cli("refine", *arguments[:-2], "--iterations", 1, "--keep-failed")
-    assert "1 failed (start poses kept)" in result.stdout
-    kept, sidecar = read_results(out), read_sidecar(out)
-    assert sidecar["settings"]["min_confidence"] == 0
-    assert (len(kept), sidecar["start_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
-    assert kept[2].score == 0
-    np.testing.assert_allclose(kept[2].T_cam_obj, starts[2].T_cam_obj)
-    between = (kept[0].score + kept[1].score) / 2
-    result = cli("refine", *arguments[:-2], "--iterations", 1, "--min-confidence", between)
-    assert "2 failed" in result.stdout
-    doubted, sidecar = min(kept[:2], key=lambda estimate: estimate.score), read_sidecar(out)
-    why = f"after 1 updates its confidence is {doubted.score:.3f}, {between:g} needed"
-    assert sidecar["failures"][str(doubted.line)] == why
-    assert sidecar["start_lines"] == [{2: 3, 3: 2}[doubted.line]]
-
-
-def test_what_was_finished_is_written_when_something_ends_it(cli, bop, trained, tmp_path, monkeypatch):
-    root, start = bop
-    two = tmp_path / "two"
-    shutil.copytree(root, two)
-    for name in ("scene_camera.json", "scene_gt.json"):
-        file = two / "test" / "000001" / name
-        content = json.loads(file.read_text())
-        file.write_text(json.dumps({**content, "1": content["0"]}))
-    (picture,) = (two / "test" / "000001" / "rgb").iterdir()
-    second = picture.with_stem("000001")
-    second.write_bytes(picture.read_bytes()[:200])
-    lines = start.read_text().splitlines()
-    (tmp_path / "start.csv").write_text("\n".join([lines[0], lines[1].replace("1,0,1", "1,1,1", 1), *lines[1:]]) + "\n")
-    out = tmp_path / "x.csv"
-    rest = [
-        "--checkpoint",
-        trained,
-        "--dataset",
-        two,
-        "--init",
-        tmp_path / "start.csv",
-        "--out",
-        out,
-        "--iterations",
-        1,
-    ]
-    result = cli("refine", *rest)
-    assert result.exit_code == 1
-    assert f"Stopped: 1 start poses were not reached, {out} holds the others" in result.stderr
-    assert "000001" in result.stderr.splitlines()[-1]
-    assert result.stderr.splitlines()[-1].startswith("Error: ")
-    assert (len(read_results(out)), read_sidecar(out)["not_reached"]) == (2, 1)
-    assert read_sidecar(out)["start_lines"] == [3, 4]
-    shutil.copy(picture, second)
-    calls = []
-
-    def interrupted(self, frame, requests, original=Refiner.refine_batch):
-        calls.append(len(requests))
-        if len(calls) == interrupted.at:
-            raise KeyboardInterrupt
-        return original(self, frame, requests)
-
-    monkeypatch.setattr(Refiner, "refine_batch", interrupted)
-    interrupted.at = 2
-    result = cli("refine", *rest)
-    assert (result.exit_code, read_sidecar(out)["not_reached"]) == (130, 1)
-    before = out.read_bytes()
-    calls.clear()
-    interrupted.at = 1
-    result = cli("refine", *rest)
-    assert (result.exit_code, out.read_bytes()) == (130, before)
-    assert "Stopped: nothing was finished, nothing is written" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("image", "text"),
     [
@@ -542,22 +328,6 @@ def test_an_image_that_is_no_8_bit_rgb_is_refused(image, text):
         frame.__post_init__()
 
 
-def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
-    root, start = bop
-    rest = ["--dataset", root, "--init", start, "--out", tmp_path / "x.csv"]
-    for arguments, code, text in (
-        (["--checkpoint", tmp_path / "none.safetensors", *rest], 1, "no such checkpoint"),
-        (["--checkpoint", trained, *rest, "--object", "5"], 2, "no pose of object 5"),
-        (["--checkpoint", trained, *rest, "--hypotheses", 4, "--scorer", "learned"], 1, "no confidence output"),
-        (["--checkpoint", trained, "--dataset", tmp_path / "no", *rest[2:]], 1, "no such folder"),
-    ):
-        result = cli("refine", *arguments)
-        assert result.exit_code == code, result.output
-        assert text in result.stderr
-        assert "Traceback" not in result.output
-        assert len([line for line in result.stderr.splitlines() if line.startswith("Error: ")]) == 1
-
-
 def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tmp_path):
     """The digest that training stores fits the mesh that a BOP dataset or a file brings, and no other."""
     small = ["--steps", 1, "--batch", 4, "--workers", 0, "--threads", 1, "--set", "loss.contour_points=32"]
@@ -567,10 +337,3 @@ def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tm
     painted = replace(mesh, vertex_rgb=255 - mesh.vertex_rgb, sha256="f" * 64)
     with pytest.raises(CheckpointError, match="object 1 is another mesh than in training"):
         Refiner.load(tmp_path / "run" / "best.safetensors", {1: painted})
-
-
-def test_a_method_and_its_checkpoint_belong_together(cli, bop, tmp_path):
-    root, start = bop
-    result = cli("refine", "--dataset", root, "--init", start, "--out", tmp_path / "x.csv")
-    assert result.exit_code == 2
-    assert "--method network needs a --checkpoint" in result.stderr

@@ -35,9 +35,8 @@ from refinenet.baselines.sparse_views import sparse_views
 from refinenet.baselines.view import Target, look
 from refinenet.methods import Refinement, Request, Status, make_baseline
 
-from .conftest import K
+from .conftest import K, make_bop
 from .test_baselines import LMO_OBJECTS, distances, rendered_frame
-from .test_refine import make_bop
 
 
 def far_start(truth, seed):

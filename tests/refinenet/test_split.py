@@ -3,6 +3,7 @@
 import itertools
 import json
 import logging
+import math
 import shutil
 import threading
 import time
@@ -14,15 +15,18 @@ import torch
 from posecore.errors import ShardError
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
+from refinenet.config import load_config
 from refinenet.data import PairStream, make_loader
-from refinenet.split import DataRecord, Growth, divide, read_scenes, split_by_scene
+from refinenet.growth import Growth
+from refinenet.split import DataRecord, divide, drawn_out, read_scenes
 from refinenet.train import train
 from refinenet.trainer import Trainer
 
-from .test_data import assert_equal, make_stream, take
+from .test_data import SMALL, assert_equal, make_stream, split_by_scene, take
 from .test_train import small
 
-HELD_OUT = (0, 5)
+HELD_OUT = (1, 3, 13)
+"""What seed 0 draws out of the 24 scenes with a share of 0.2: two in the first shard, one in the fourth."""
 
 
 @pytest.fixture
@@ -53,9 +57,17 @@ def damaged(dataset, tmp_path):
 
 def follow(url, out, start=0):
     scene_of, _ = read_scenes(ShardReader(str(url)), [0, 1])
-    record = DataRecord(shards=(0, 1), held_out=HELD_OUT)
-    growth = Growth(out=out, record=record)
+    record = DataRecord(shards=(0, 1), held_out=HELD_OUT[:2])
+    growth = Growth(out=out, record=record, config=load_config("compact", SMALL))
     return make_stream(url, divide(scene_of, HELD_OUT)[0], ["hypothesis.fresh=false"], start=start, growth=growth)
+
+
+def test_a_scene_is_held_out_or_not_whatever_others_there_are():
+    scenes = np.arange(24)
+    assert tuple(drawn_out(scenes, 0.2, 0)) == HELD_OUT
+    assert tuple(drawn_out(scenes[2:15], 0.2, 0)) == HELD_OUT[1:]
+    assert abs(len(drawn_out(np.arange(2000), 0.1, 0)) - 200) < 40
+    assert set(drawn_out(scenes, 0.2, 1)) != set(HELD_OUT)
 
 
 def test_new_shards_join_between_epochs_and_held_out_scenes_stay_out(growing, tmp_path):
@@ -71,9 +83,11 @@ def test_new_shards_join_between_epochs_and_held_out_scenes_stay_out(growing, tm
     last = json.loads(max((tmp_path / "growth").iterdir()).read_text())
     assert last == {"shards": [4, 5], "complete": True}
     reader = ShardReader(str(url))
-    for group in itertools.islice(stream.groups(0), 30):
-        for _, shard, row in group:
-            assert reader.read(shard, ["scene_index"])["scene_index"][row] not in HELD_OUT
+    groups = itertools.islice(stream.groups(0), 30)
+    trained = {
+        int(reader.read(shard, ["scene_index"])["scene_index"][row]) for group in groups for _, shard, row in group
+    }
+    assert trained == set(range(24)) - set(HELD_OUT)
 
 
 def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path):
@@ -92,7 +106,7 @@ def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path
 def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, monkeypatch, caplog):
     url, reveal = growing
     reveal(0)
-    monkeypatch.setattr("refinenet.trainer.FOLLOW_POLL_S", 0.05)
+    monkeypatch.setattr("refinenet.growth.POLL_S", 0.05)
 
     def render():
         for n in range(1, 7):
@@ -113,6 +127,66 @@ def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, mo
     train(small("loader.follow=true", "steps=34", "batch=4"), str(url), tmp_path / "run", resume=True)
     assert [path.read_text() for path in sorted((tmp_path / "run/growth").iterdir())][: len(before)] == before
     assert json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"] == held_out
+
+
+def test_later_shards_bring_held_out_pairs_until_there_are_enough(growing, tmp_path):
+    url, reveal = growing
+    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "steps=16", "batch=4"]
+
+    def trainer(out, *more, resume=False):
+        return Trainer(small(*options, *more), str(url), tmp_path / out, resume=resume)
+
+    def ids(run):
+        return sorted(map(tuple, torch.cat([batch.sample_ids for batch in run._held_out.batches]).tolist()))
+
+    run, enough = trainer("run", "validation.pairs=64"), trainer("enough", "validation.pairs=4")
+    first = [(0, 2), (0, 3), (0, 6), (0, 7)]
+    assert ids(run) == ids(enough) == first
+    run.save(run.validate())
+    assert run.validate()["validation/pairs"] == 4
+    best_mm = run.best_mm
+    assert best_mm < math.inf
+    reveal(6)
+    for each in (run, enough):
+        batches = each.stream()
+        while not (each.out / "growth").is_dir():
+            each.take_step(next(batches))
+        each.validate()
+    assert ids(run) == [*first, (3, 2), (3, 3)]
+    assert ids(enough) == first
+    assert run.best_mm == math.inf  # was measured on other pairs
+    run.save(run.validate())
+    resumed = trainer("run", "validation.pairs=64", resume=True)
+    assert ids(resumed) == ids(run)
+    assert resumed.best_mm == run.best_mm < math.inf
+    assert resumed.validate() == run.validate()
+
+
+def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, monkeypatch, caplog):
+    url, reveal = growing
+    monkeypatch.setattr("refinenet.growth.POLL_S", 0.05)
+    reveal(6)
+    later = tmp_path / "later"
+    starting = threading.Timer(0.5, lambda: url.rename(later))
+    starting.start()
+    with caplog.at_level(logging.WARNING):
+        train(small("loader.follow=true", "steps=2", "batch=4"), str(later), tmp_path / "run")
+    starting.join()
+    assert f"{later}: no dataset here yet, waiting for one" in caplog.text
+
+
+def test_training_waits_for_scenes_on_both_sides(growing, tmp_path, monkeypatch, caplog):
+    """Seed 2 draws out scene 6 first, which comes with the second shard."""
+    url, reveal = growing
+    monkeypatch.setattr("refinenet.growth.POLL_S", 0.05)
+    assert drawn_out(np.arange(8), 0.1, 2).tolist() == [6]
+    reveal(1)
+    later = threading.Timer(0.5, lambda: reveal(2))
+    later.start()
+    with caplog.at_level(logging.WARNING):
+        Trainer(small("loader.follow=true", "validation.scene_share=0.1", "seed=2"), str(url), tmp_path / "run")
+    later.join()
+    assert "none of 4 scenes is held out yet, waiting for more" in caplog.text
 
 
 def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):

@@ -159,7 +159,7 @@ def test_every_loss_trains(dataset, tmp_path):
         trainer = Trainer(small(f"loss.name={name}"), str(dataset), tmp_path)
         values = trainer.take_step(next(trainer.stream()))
         assert all(np.isfinite(value) for value in values.values())
-        assert ("loss_mse" in values) == (name == "mse")
+        assert ("loss_px" in values) == (name != "mse")
 
 
 @pytest.mark.slow

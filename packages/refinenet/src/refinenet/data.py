@@ -23,12 +23,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
+from refinenet.growth import Growth
 from refinenet.hypothesis import PairArrays, PairMaker
 from refinenet.loss import Target
 from refinenet.network import Pair
 from refinenet.objects import for_patches, load_models, symmetries_of
 from refinenet.recut import fixed_sides_px
-from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Growth, Split
+from refinenet.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
 from refinenet.stored import STORED_FIELDS, stored_pairs
 
 Array = np.ndarray
@@ -76,6 +77,7 @@ class PairSource:
             )
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()
+        self._cache_mb = config.loader.cache_mb if training else 0  # what is measured is read once
         self._cache: dict[int, dict[str, Array]] = {}
         self._bad: dict[int, str] = {}
         self._untold: list[str] = []
@@ -123,7 +125,7 @@ class PairSource:
                 if shard not in self._bad:
                     self._bad[shard] = str(error)
                     self._untold.append(str(error))
-        room = self._config.loader.cache_mb * 2**20 - sum(map(_bytes, self._cache.values()))
+        room = self._cache_mb * 2**20 - sum(map(_bytes, self._cache.values()))
         for shard, arrays in read.items():
             # What is in stays in: replacing the oldest would miss every time when an epoch does not fit.
             if shard not in self._cache and _bytes(arrays) <= room:
@@ -360,17 +362,3 @@ def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]
             if tensor is not None:
                 tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
         yield there
-
-
-def validation_batches(source: PairSource, split: Split, batch: int) -> Iterator[Batch]:
-    """Batches of a split in the order of its rows, the same at every call."""
-    for shard, rows in sorted(split.rows.items()):
-        arrays = source.load([shard]).get(shard)
-        if arrays is None:
-            continue
-        for first in range(0, len(rows), batch):
-            chosen = rows[first : first + batch]
-            samples = [{name: values[row] for name, values in arrays.items()} for row in chosen]
-            made = source.batch([(0, shard, int(row)) for row in chosen], samples)
-            if made is not None:
-                yield made

@@ -199,6 +199,8 @@ def confidence_loss(update: PoseUpdate, wanted: Float[Tensor, " b"]) -> Float[Te
     return torch.nn.functional.binary_cross_entropy_with_logits(update.confidence.float(), wanted, reduction="none")
 
 
+PIXEL_LOSSES = ("contour", "contour-forward", "point", "contour+point")
+"""Those in patch pixels, as long as no confidence is trained beside them."""
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 MOST_FLOW_COST = 50.0
 CLOSE = 0.06

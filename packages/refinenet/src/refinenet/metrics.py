@@ -57,9 +57,9 @@ def measure(
 ) -> dict[str, float]:
     """Errors before and after one update: mean of each, and the rotation's median.
 
-    Keys: validation/rotation_before_deg, validation/rotation_after_deg, validation/rotation_median_after_deg,
-    validation/x_before_mm and so on; from a network with that output also validation/confidence_error, the mean
-    distance of its confidence from what it is to say of each start.
+    Keys: validation/pairs, validation/rotation_before_deg, validation/rotation_after_deg,
+    validation/rotation_median_after_deg, validation/x_before_mm and so on; from a network with that output also
+    validation/confidence_error, the mean distance of its confidence from what it is to say of each start.
     """
     was_training = network.training
     network.eval()
@@ -78,7 +78,8 @@ def measure(
                 collected.setdefault(f"validation/{what}_{when}_{unit}", []).append(values.cpu())
     network.train(was_training)
     joined = {key: torch.cat(values).double() for key, values in collected.items()}
-    result = {key: float(values.mean()) for key, values in joined.items()}
+    result = {"validation/pairs": float(len(joined["validation/add_after_mm"]))}
+    result |= {key: float(values.mean()) for key, values in joined.items()}
     for when in ("before", "after"):
         result[f"validation/rotation_median_{when}_deg"] = float(
             joined[f"validation/rotation_{when}_deg"].quantile(0.5)

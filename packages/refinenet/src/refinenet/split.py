@@ -1,22 +1,19 @@
-"""Which samples are trained on and which are held out: by scene, also while a dataset is still growing.
+"""Which samples are trained on and which are held out, by scene.
 
-A run fixes at its start which scenes are held out and which shards it begins with, in `data.json`. A run that follows a
-growing dataset adds one small file an epoch, written by whichever process comes there first and read by all: so ranks,
-loader processes and resumed runs agree on what an epoch holds.
+A run fixes at its start which scenes are held out and which shards it begins with, in `data.json`.
 """
 
 import itertools
 import json
-import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from posecore.errors import CheckpointError, ShardError
-from posecore.files import storage_error, write_atomic
-from posecore.shard import ShardReader, n_shards
+from posecore.files import write_atomic
+from posecore.shard import ShardReader
 
 Array = np.ndarray
 ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, OWN = range(6)
@@ -113,24 +110,47 @@ def read_scenes(
     return scenes, bad
 
 
-def held_out_scenes(url: str, scene_of: Mapping[int, Array], share: float, seed: int) -> Array:
-    """Scenes to hold out, at least one, drawn from the seed.
+def held_out_scenes(
+    url: str, scene_of: Mapping[int, Array], share: float, seed: int, *, growing: bool = False
+) -> Array:
+    """Scenes to hold out, at least one.
+
+    Args:
+        url: Of the dataset, for messages.
+        scene_of: Scene of every sample by shard.
+        share: Of the scenes.
+        seed: Of the choice.
+        growing: Take those that `drawn_out` says, which does not ask for all scenes at once; where that leaves nothing
+            on one side, as of a complete dataset.
 
     Raises:
         ShardError: No shard is there, or fewer than two scenes.
     """
     if not scene_of:
         raise ShardError(f"{url}: no finished shard; let `synthgen render` write one first, or wait with --follow")
-    scenes = _scenes(scene_of)
+    scenes = scenes_in(scene_of)
     if len(scenes) < 2:
         raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
+    if growing and both_sides(scenes, share, seed):
+        return drawn_out(scenes, share, seed)
     held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
     return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held])
 
 
+def drawn_out(scenes: Array, share: float, seed: int) -> Array:
+    """Scenes of a growing dataset that are held out: each is drawn by itself, with probability `share`."""
+    draws = [np.random.default_rng([seed, SPLIT, int(scene)]).random() for scene in scenes]
+    return np.asarray(scenes[np.array(draws) < share])
+
+
+def both_sides(scenes: Array, share: float, seed: int) -> bool:
+    """Whether `drawn_out` leaves scenes to train on and scenes to measure on."""
+    return 0 < len(drawn_out(scenes, share, seed)) < len(scenes)
+
+
 def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tuple[Split, Split]:
     """Samples for training and for validation."""
-    held = np.isin(_scenes(scene_of), held_out)
+    held = np.isin(scenes_in(scene_of), held_out)
 
     def side(inside: bool) -> Split:
         rows = {
@@ -142,25 +162,10 @@ def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tu
     return side(False), side(True)
 
 
-def _scenes(scene_of: Mapping[int, Array]) -> Array:
+def scenes_in(scene_of: Mapping[int, Array]) -> Array:
     """Numbers of the scenes that samples belong to."""
-    found = np.unique(np.concatenate(list(scene_of.values())))
+    found = np.unique(np.concatenate([np.array([], np.int64), *scene_of.values()]))
     return np.asarray(found[found != OTHER_OBJECT])
-
-
-def split_by_scene(reader: ShardReader, validation_share: float, seed: int) -> tuple[Split, Split]:
-    """Divide a dataset's samples into training and validation by scene, never by sample.
-
-    Args:
-        reader: The dataset.
-        validation_share: Share of scenes held out, at least one.
-        seed: Of the choice.
-
-    Raises:
-        ShardError: No shard is there, one cannot be read, or there are fewer than two scenes.
-    """
-    scene_of, _ = read_scenes(reader, reader.committed)
-    return divide(scene_of, held_out_scenes(reader.url, scene_of, validation_share, seed))
 
 
 def spread_rows(split: Split, count: int) -> Split:
@@ -169,60 +174,3 @@ def spread_rows(split: Split, count: int) -> Split:
     chosen = [keys[i] for i in np.unique(np.linspace(0, len(keys) - 1, min(count, len(keys))).astype(int))]
     by_shard = itertools.groupby(chosen, key=lambda key: key[0])
     return Split(rows={shard: np.array([row for _, row in rows]) for shard, rows in by_shard}, scenes=split.scenes)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Growth:
-    """Takes new shards of a growing dataset into training, an epoch at a time.
-
-    Attributes:
-        out: Folder of the run, the same for all its processes.
-        record: What the run began with.
-        skip_bad_shards: Whether a new shard that cannot be read is left for a later epoch, or an error.
-        objects: Ids to train on; empty takes all.
-    """
-
-    out: Path
-    record: DataRecord
-    skip_bad_shards: bool = False
-    objects: tuple[int, ...] = ()
-
-    def epochs(self, url: str) -> Iterator[dict[int, Array]]:
-        """Training rows by shard that join at each epoch from epoch 1 on, until the dataset is complete.
-
-        Raises:
-            ShardError: A new shard cannot be read, or is gone from the manifest.
-            StorageError: The file of an epoch cannot be written.
-        """
-        reader = ShardReader(url)
-        known = set(self.record.shards)
-        for epoch in itertools.count(1):
-            path = self.out / GROWTH / f"epoch-{epoch:06d}.json"
-            if not path.exists():
-                reader.refresh()
-                new, _ = read_scenes(reader, sorted({*reader.committed} - known), skip=self.skip_bad_shards)
-                complete = len(known | set(new)) == n_shards(reader.card)
-                _write_once(path, {"shards": sorted(new), "complete": complete})
-            found = json.loads(path.read_text())
-            if set(found["shards"]) - {*reader.committed}:
-                reader.refresh()
-            scene_of, _ = read_scenes(reader, found["shards"], skip=self.skip_bad_shards, objects=self.objects)
-            known |= set(scene_of)
-            held_out = (*self.record.held_out, OTHER_OBJECT)
-            yield {s: np.flatnonzero(~np.isin(index, held_out)) for s, index in scene_of.items()}
-            if found["complete"]:
-                return
-
-
-def _write_once(path: Path, content: Mapping[str, object]) -> None:
-    """Write a JSON file whole, unless another process has done so."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    write_atomic(temporary, json.dumps(content).encode())
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        pass
-    except OSError as error:
-        raise storage_error(path, error) from error
-    finally:
-        temporary.unlink(missing_ok=True)

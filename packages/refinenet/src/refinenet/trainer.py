@@ -6,35 +6,33 @@ import json
 import logging
 import math
 import os
-import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import torch
-from posecore.errors import CheckpointError, ConfigError, ShardError
+from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import mesh_digest
-from posecore.shard import ShardReader, load_meshes, n_shards
+from posecore.shard import ShardReader, load_meshes
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from refinenet import backbone, checkpoint, metrics
 from refinenet.config import TrainConfig
-from refinenet.data import Batch, PairSource, PairStream, make_loader, on_device, validation_batches
+from refinenet.data import Batch, PairStream, make_loader, on_device
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
-from refinenet.loss import make_loss
+from refinenet.growth import Growth, wait_for_dataset, wait_for_start
+from refinenet.held_out import HeldOut
+from refinenet.loss import PIXEL_LOSSES, make_loss
 from refinenet.network import Pair, PaperNet, make_network
 from refinenet.objects import load_models, object_ids, object_points
 from refinenet.optimise import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 from refinenet.own_predictions import OwnPredictions
-from refinenet.split import DataRecord, Growth, Split, divide, held_out_scenes, read_scenes, spread_rows
+from refinenet.split import DataRecord, Split, divide, held_out_scenes, read_scenes
 
 log = logging.getLogger(__name__)
-
-FOLLOW_POLL_S = 2.0
-"""Time between looks at a growing dataset that has too few shards to begin with."""
 
 
 def use_bfloat16(precision: str, device: torch.device) -> bool:
@@ -89,12 +87,16 @@ class Trainer:
         self._reduced = use_bfloat16(config.precision, self.device)
         self.skipped: dict[str, None] = {}
         last = self._last() if resume else None
+        if config.loader.follow and not resume:
+            wait_for_dataset(url)
         reader = ShardReader(url)
         if unknown := set(config.objects) - {*object_ids(reader)}:
             known = ", ".join(map(str, object_ids(reader)))
             raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; choose among those")
-        self.training, self.validation, self._record = self._split(reader, resume=resume)
-        self._held_out = self._make_held_out()
+        self.training, self.validation, record = self._split(reader, resume=resume)
+        self._growth = Growth(out=out, record=record, config=config) if config.loader.follow else None
+        self._held_out = HeldOut(url, config, self.validation, self._growth) if self.rank == 0 else None
+        self._tell_skipped(*(self._held_out.skipped if self._held_out else ()))
         meshes = load_meshes(reader)
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
         self._own_predictions = OwnPredictions(config, meshes, self.rank, reduced=self._reduced)
@@ -113,7 +115,8 @@ class Trainer:
             confidence_target=config.loss.confidence_target, min_closeness=config.loss.min_closeness,
             objects=self.objects,
         )  # fmt: skip
-        self.loss_key = "loss_mse" if config.loss.name == "mse" else "loss_px"
+        pixels = config.loss.name in PIXEL_LOSSES and not config.network.confidence
+        self.loss_key = "loss_px" if pixels else "loss"
         self._optimiser = make_optimiser(self.network, config.optimiser)
         self._guard = FiniteGuard(self._optimiser, self.device, late=self.device.type == "cuda")
         self.step, self.best_mm = 0, math.inf
@@ -147,22 +150,31 @@ class Trainer:
 
     def _last(self) -> checkpoint.Checkpoint:
         last = checkpoint.load(self.out / "last.safetensors", self.config.preset)
-        checkpoint.require_same(last.provenance.config, self.config, last.path)
+        before = last.provenance.config
+        checkpoint.require_same(before, self.config, last.path)
+        if self.config.optimiser.schedule == "cosine" and before.steps != self.config.steps:
+            rates = [learning_rate(last.provenance.step, c.steps, c.optimiser) for c in (before, self.config)]
+            log.warning(
+                "%s: steps was %d and is now %d, so the cosine rate jumps from %.3g to %.3g",
+                last.path, before.steps, self.config.steps, *rates,
+            )  # fmt: skip
         return last
 
     def _split(self, reader: ShardReader, *, resume: bool) -> tuple[Split, Split, DataRecord]:
         """Both sides of the split, the same on every rank: rank 0 decides, or reads what the run began with."""
         shared: list[Any] = [None]
         if self.rank == 0:
-            settings = self.config.loader
+            settings, validation = self.config.loader, self.config.validation
             if settings.follow and not resume:
-                _wait_for_shards(reader, self.world * max(1, settings.workers))
+                wait_for_start(reader, self.config, self.world * max(1, settings.workers))
             record = DataRecord.load(self.out) if resume else None
             begun = record.shards if record is not None else reader.committed
             scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards, objects=self.config.objects)
             self._tell_skipped(*bad.values())
             if record is None:
-                held = held_out_scenes(reader.url, scene_of, self.config.validation.scene_share, self.config.seed)
+                held = held_out_scenes(
+                    reader.url, scene_of, validation.scene_share, self.config.seed, growing=settings.follow
+                )
                 record = DataRecord(shards=tuple(scene_of), held_out=tuple(int(scene) for scene in held))
                 record.save(self.out)
             shared = [(record, scene_of)]
@@ -170,26 +182,6 @@ class Trainer:
             torch.distributed.broadcast_object_list(shared, src=0)
         record, scene_of = shared[0]
         return (*divide(scene_of, record.held_out), record)
-
-    def _make_held_out(self) -> list[Batch]:
-        """Held-out pairs, made once and kept: the same are measured every time, without a GL context in this process.
-
-        Raises:
-            ShardError: None can be read.
-        """
-        if self.rank != 0:
-            return []
-        source = PairSource(self._url, self.config, training=False)
-        try:
-            measured = spread_rows(self.validation, self.config.validation.pairs)
-            batches = list(validation_batches(source, measured, self.config.batch))
-        finally:
-            source.close()
-        if not batches:
-            raise ShardError(f"{self._url}: no held-out pair can be read; render its damaged shards again")
-        for batch in batches:
-            self._tell_skipped(*batch.skipped)
-        return batches
 
     def _tell_skipped(self, *messages: str) -> None:
         for message in messages:
@@ -210,7 +202,9 @@ class Trainer:
         if self._average is not None:
             self._average.network.load_state_dict(last.tensors)
         self._optimiser.load_state_dict(state["optimiser"])
-        self.step, self.best_mm = last.provenance.step, float(state["best_mm"])
+        self.step = last.provenance.step
+        if self._held_out is not None and state["held_out_pairs"] == self._held_out.pairs:
+            self.best_mm = float(state["best_mm"])
         if self.rank == 0:
             checkpoint.drop_leftovers(self.out, self.step)
 
@@ -223,12 +217,9 @@ class Trainer:
         """Training batches on the device, from the present step on."""
         settings = self.config.loader
         workers = max(1, min(settings.workers, len(self.training.rows) // self.world))
-        growth = Growth(
-            out=self.out, record=self._record, skip_bad_shards=settings.skip_bad_shards, objects=self.config.objects
-        )
         stream = PairStream(
             url=self._url, config=self.config, split=self.training, rank=self.rank, world=self.world, workers=workers,
-            start=self.step * self.config.optimiser.accumulate, growth=growth if settings.follow else None,
+            start=self.step * self.config.optimiser.accumulate, growth=self._growth,
         )  # fmt: skip
         return on_device(iter(make_loader(stream, pin=self.device.type == "cuda")), self.device)
 
@@ -296,21 +287,31 @@ class Trainer:
         self._guard.settle()
 
     def over_ranks(self, values: dict[str, float | Tensor]) -> dict[str, float]:
-        """A step's values as numbers, the loss averaged over all ranks; call on every rank.
+        """A step's values as numbers, those that are each rank's own averaged over all; call on every rank.
 
         Raises:
             TrainingError: As `take_step`.
         """
         self.settle()
-        loss = values[self.loss_key]
-        if self.world > 1 and isinstance(loss, Tensor):
-            torch.distributed.all_reduce(loss)
-            loss /= self.world
+        for key in (self.loss_key, "visible_share"):
+            value = values.get(key)
+            if self.world > 1 and value is not None:
+                mean = torch.as_tensor(value, device=self.device) / self.world
+                torch.distributed.all_reduce(mean)
+                values = {**values, key: mean}
         return {key: float(value) for key, value in values.items()}
 
     def validate(self) -> dict[str, float]:
-        """Errors on held-out pairs, before and after one update; on rank 0."""
-        return metrics.measure(self.kept, self._held_out, self.objects, self.device, self.config.loss.confidence_target)
+        """Errors on held-out pairs, before and after one update; on rank 0.
+
+        Where more pairs have joined, errors do not compare with those before, and the best so far is forgotten.
+        """
+        assert self._held_out is not None
+        if self._held_out.grow():
+            self._tell_skipped(*self._held_out.skipped)
+            self.best_mm = math.inf
+        batches, target = self._held_out.batches, self.config.loss.confidence_target
+        return metrics.measure(self.kept, batches, self.objects, self.device, target)
 
     def save(self, errors: dict[str, float] | None) -> None:
         """Write `last`, and `best` when the errors are the best so far.
@@ -330,7 +331,11 @@ class Trainer:
         if errors is not None and errors["validation/add_after_mm"] < self.best_mm:
             checkpoint.save(self.out / "best.safetensors", self.kept, provenance)
             self.best_mm = errors["validation/add_after_mm"]
-        state = {"optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm, "world": self.world}
+        assert self._held_out is not None
+        state = {
+            "optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm, "world": self.world,
+            "held_out_pairs": self._held_out.pairs,
+        }  # fmt: skip
         if self._average is not None:
             state["weights"] = self.network.state_dict()
         checkpoint.save_state(self.out, self.step, state)
@@ -353,14 +358,3 @@ def _dataset_sha256(reader: ShardReader, config: TrainConfig) -> str:
     if config.loader.follow:
         return hashlib.sha256(json.dumps(reader.card, sort_keys=True).encode()).hexdigest()
     return reader.digest
-
-
-def _wait_for_shards(reader: ShardReader, wanted: int) -> None:
-    """Wait until a growing dataset has a shard for each loader process, or all it will ever have."""
-    told = False
-    while len(reader.committed) < min(wanted, n_shards(reader.card)):
-        if not told:
-            log.warning("%s: %d shards, waiting for %d", reader.url, len(reader.committed), wanted)
-            told = True
-        time.sleep(FOLLOW_POLL_S)
-        reader.refresh()
