@@ -422,6 +422,25 @@ def test_validation_measures_the_confidence_against_what_it_is_to_say(dataset):
     assert abs(errors["overlap"] - errors["closeness"]) > 0.01
 
 
+def test_what_the_loss_leaves_out_is_not_measured(dataset):
+    config = flow_config("network.confidence=true", "loss.min_closeness=0.2")
+    batch, points = batch_of(dataset, config, training=False), points_of_dataset(dataset)
+    close = loss.closeness(batch.target, points)
+    counted = close >= 0.2
+    assert 0 < counted.sum() < len(counted)
+    before = metrics.pose_errors(batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
+
+    def measured(least):
+        return metrics.measure(Unsure(), [batch], points, torch.device("cpu"), "closeness", least)
+
+    some, every, none = measured(0.2), measured(0.0), measured(0.999)
+    assert some["validation/pairs"] == counted.sum()
+    assert some["validation/add_before_mm"] == pytest.approx(float(before["add_mm"][counted].mean()), rel=1e-5)
+    assert every["validation/add_before_mm"] == pytest.approx(float(before["add_mm"].mean()), rel=1e-5)
+    assert none == every  # where it counts none, there is nothing better to say
+    assert some["validation/confidence_error"] == every["validation/confidence_error"]
+
+
 def test_onnx_and_program_give_its_updates(run, cli, tmp_path):
     for name in ("model.onnx", "model.pt2"):
         result = cli("export", "--checkpoint", run.path, "--out", tmp_path / name)

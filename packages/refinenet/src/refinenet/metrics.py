@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from refinenet import geometry
 from refinenet.data import Batch
-from refinenet.loss import ObjectPoints, wanted_confidence
+from refinenet.loss import ObjectPoints, closeness, wanted_confidence
 
 
 def pose_errors(
@@ -54,36 +54,46 @@ def measure(
     objects: ObjectPoints,
     device: torch.device,
     confidence_target: str = "overlap",
+    min_closeness: float = 0.0,
 ) -> dict[str, float]:
     """Errors before and after one update: mean of each, and the rotation's median.
 
-    Keys: validation/pairs, validation/rotation_before_deg, validation/rotation_after_deg,
-    validation/rotation_median_after_deg, validation/x_before_mm and so on; from a network with that output also
-    validation/confidence_error, the mean distance of its confidence from what it is to say of each start.
+    Keys: validation/rotation_before_deg, validation/rotation_after_deg, validation/rotation_median_after_deg,
+    validation/x_before_mm and so on; from a network with that output also validation/confidence_error, the mean
+    distance of its confidence from what it is to say of each start.
+
+    Errors are those of the pairs that the loss counts, as many as validation/pairs says: what it leaves out because it
+    is too far off to be mended would drown them. The confidence is asked about all.
     """
     was_training = network.training
     network.eval()
     collected: dict[str, list[Tensor]] = {}
+    counted: list[Tensor] = []
+    off: list[Tensor] = []
     for batch in batches:
         batch = batch.to(device)
+        counted.append(closeness(batch.target, objects).cpu() >= min_closeness)
         start, update = batch.pair.T_cam_obj, network(batch.pair)
         if update.confidence is not None:
             wanted = wanted_confidence(confidence_target, batch.target, objects)
-            off = (torch.sigmoid(update.confidence) - wanted).abs()
-            collected.setdefault("validation/confidence_error", []).append(off.cpu())
+            off.append((torch.sigmoid(update.confidence) - wanted).abs().cpu())
         for when, pose in (("before", start), ("after", geometry.apply_update(start, update))):
             errors = pose_errors(pose, batch.target.T_cam_obj, batch.target.object_index, objects)
             for name, values in errors.items():
                 what, unit = name.rsplit("_", 1)
                 collected.setdefault(f"validation/{what}_{when}_{unit}", []).append(values.cpu())
     network.train(was_training)
-    joined = {key: torch.cat(values).double() for key, values in collected.items()}
-    result = {"validation/pairs": float(len(joined["validation/add_after_mm"]))}
+    chosen = torch.cat(counted)
+    if not chosen.any():
+        chosen[:] = True
+    joined = {key: torch.cat(values)[chosen].double() for key, values in collected.items()}
+    result = {"validation/pairs": float(chosen.sum())}
     result |= {key: float(values.mean()) for key, values in joined.items()}
     for when in ("before", "after"):
-        result[f"validation/rotation_median_{when}_deg"] = float(
-            joined[f"validation/rotation_{when}_deg"].quantile(0.5)
-        )
+        rotation_deg = joined[f"validation/rotation_{when}_deg"]
+        result[f"validation/rotation_median_{when}_deg"] = float(rotation_deg.quantile(0.5))
+    if off:
+        result["validation/confidence_error"] = float(torch.cat(off).double().mean())
     return result
 
 

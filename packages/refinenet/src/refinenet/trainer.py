@@ -310,8 +310,10 @@ class Trainer:
         if self._held_out.grow():
             self._tell_skipped(*self._held_out.skipped)
             self.best_mm = math.inf
-        batches, target = self._held_out.batches, self.config.loss.confidence_target
-        return metrics.measure(self.kept, batches, self.objects, self.device, target)
+        loss = self.config.loss
+        return metrics.measure(
+            self.kept, self._held_out.batches, self.objects, self.device, loss.confidence_target, loss.min_closeness
+        )
 
     def save(self, errors: dict[str, float] | None) -> None:
         """Write `last`, and `best` when the errors are the best so far.

@@ -46,7 +46,7 @@ log = logging.getLogger(__name__)
 @click.option("--init", type=FILE, metavar="FILE", help="Checkpoint whose weights the run begins with.")
 @click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
 @click.option("--resume", is_flag=True, help="Go on with the run in --out.")
-@click.option("--follow", is_flag=True, help="SHARDS is still being rendered: take new shards in between epochs.")
+@click.option("--follow", is_flag=True, help="SHARDS is being rendered, or will be: take new shards in between epochs.")
 @click.option("--skip-bad-shards", is_flag=True, help="Train without shards that cannot be read; each is named.")
 @quiet_option
 @verbose_option
