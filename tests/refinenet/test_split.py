@@ -186,7 +186,7 @@ def test_training_waits_for_scenes_on_both_sides(growing, tmp_path, monkeypatch,
     with caplog.at_level(logging.WARNING):
         Trainer(small("loader.follow=true", "validation.scene_share=0.1", "seed=2"), str(url), tmp_path / "run")
     later.join()
-    assert "none of 4 scenes is held out yet, waiting for more" in caplog.text
+    assert "0 of 4 scenes are held out, waiting for more scenes" in caplog.text
 
 
 def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):

@@ -92,17 +92,7 @@ class Growth:
         return divide(scene_of, np.union1d(self.record.held_out, drawn))
 
 
-def wait_for_dataset(url: str) -> None:
-    """Wait until whoever renders a dataset has begun it."""
-    store, told = open_store(url), False
-    while store.get(GROUP) is None:
-        if not told:
-            log.warning("%s: no dataset here yet, waiting for one", url)
-            told = True
-        time.sleep(POLL_S)
-
-
-def wait_for_start(reader: ShardReader, config: TrainConfig, wanted: int) -> None:
+def wait_for_start(url: str, config: TrainConfig, wanted: int) -> None:
     """Wait until a growing dataset has enough to begin with, or all it will ever have.
 
     That is a number of shards, one for each loader process, and scenes on both sides of the split.
@@ -110,23 +100,30 @@ def wait_for_start(reader: ShardReader, config: TrainConfig, wanted: int) -> Non
     Raises:
         ShardError: A shard cannot be read and `loader.skip_bad_shards` is off.
     """
+    told = set[str]()
+
+    def wait(found: str, lacking: str) -> None:
+        if lacking not in told:
+            log.warning("%s: %s, waiting for %s", url, found, lacking)
+            told.add(lacking)
+        time.sleep(POLL_S)
+
+    store = open_store(url)
+    while store.get(GROUP) is None:
+        wait("no dataset here yet", "one")
+    reader, share, seed = ShardReader(url), config.validation.scene_share, config.seed
     scenes, looked_at = np.array([], np.int64), set[int]()
-    told = ""
     while not reader.complete:
         new = sorted({*reader.committed} - looked_at)
         looked_at |= set(new)
         found, _ = read_scenes(reader, new, skip=config.loader.skip_bad_shards, objects=config.objects)
         scenes = np.union1d(scenes, scenes_in(found))
         if len(looked_at) < wanted:
-            lacking = f"{len(looked_at)} shards, waiting for {wanted}"
-        elif not both_sides(scenes, config.validation.scene_share, config.seed):
-            lacking = f"none of {len(scenes)} scenes is held out yet, waiting for more"
+            wait(f"{len(looked_at)} shards", str(wanted))
+        elif not both_sides(scenes, share, seed):
+            wait(f"{len(drawn_out(scenes, share, seed))} of {len(scenes)} scenes are held out", "more scenes")
         else:
             return
-        if lacking.partition(",")[2] != told:
-            log.warning("%s: %s", reader.url, lacking)
-            told = lacking.partition(",")[2]
-        time.sleep(POLL_S)
         reader.refresh()
 
 

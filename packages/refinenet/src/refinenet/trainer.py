@@ -23,7 +23,7 @@ from refinenet.config import TrainConfig
 from refinenet.data import Batch, PairStream, make_loader, on_device
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
-from refinenet.growth import Growth, wait_for_dataset, wait_for_start
+from refinenet.growth import Growth, wait_for_start
 from refinenet.held_out import HeldOut
 from refinenet.loss import PIXEL_LOSSES, make_loss
 from refinenet.network import Pair, PaperNet, make_network
@@ -88,14 +88,15 @@ class Trainer:
         self.skipped: dict[str, None] = {}
         last = self._last() if resume else None
         if config.loader.follow and not resume:
-            wait_for_dataset(url)
+            # every rank for itself: one that waited for another's word would give up after some minutes
+            wait_for_start(url, config, self.world * max(1, config.loader.workers))
         reader = ShardReader(url)
         if unknown := set(config.objects) - {*object_ids(reader)}:
             known = ", ".join(map(str, object_ids(reader)))
             raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; choose among those")
-        self.training, self.validation, record = self._split(reader, resume=resume)
+        self.training, held_out, record = self._split(reader, resume=resume)
         self._growth = Growth(out=out, record=record, config=config) if config.loader.follow else None
-        self._held_out = HeldOut(url, config, self.validation, self._growth) if self.rank == 0 else None
+        self._held_out = HeldOut(url, config, held_out, self._growth) if self.rank == 0 else None
         self._tell_skipped(*(self._held_out.skipped if self._held_out else ()))
         meshes = load_meshes(reader)
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
@@ -165,8 +166,6 @@ class Trainer:
         shared: list[Any] = [None]
         if self.rank == 0:
             settings, validation = self.config.loader, self.config.validation
-            if settings.follow and not resume:
-                wait_for_start(reader, self.config, self.world * max(1, settings.workers))
             record = DataRecord.load(self.out) if resume else None
             begun = record.shards if record is not None else reader.committed
             scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards, objects=self.config.objects)
