@@ -9,8 +9,6 @@ from refinenet.agreement import OUTLINE
 
 HALF_STRENGTH = {"render": 24.0, "scene": 12.0}
 """Gradients, in grey levels over two pixels, that count half: the image's edges are softened by lens and resampling."""
-WINDOW = 12
-"""Side of the windows that are matched, in pixels."""
 LEAST_AMOUNT = 0.02
 """Share of a window that is edges, under which agreement fades."""
 
@@ -51,7 +49,7 @@ class GradientCorrelation(nn.Module):
     """How well gradients of the render agree with the scene's around each cell of four pixels, for every small shift.
 
     Colours and light of a render are not those of the image, but edges lie in the same places. So what is matched is
-    given, not learned: in windows of `WINDOW` pixels, by shifts of two pixels up to `radius`, (a) orientations of the
+    given, not learned: in windows of twelve pixels, by shifts of two pixels up to `radius`, (a) orientations of the
     strongest change of any channel, silhouette included, without their sign, and (b) directions of the change of
     lightness inside the silhouette, with it. Agreement is a share of the edges that the render has there; how many
     these are comes last.
@@ -106,8 +104,10 @@ class GradientCorrelation(nn.Module):
 
 
 def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
-    """Means over windows of three cells."""
-    return avg_pool2d(planes, WINDOW // 4, stride=1, padding=1)
+    """Means over windows of three cells, zeros beyond the border; several times as fast as torch's on a processor."""
+    planes = pad(planes, (1, 1, 1, 1))
+    rows = planes[..., :-2, :] + planes[..., 1:-1, :] + planes[..., 2:, :]
+    return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9
 
 
 def gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"], Float[Tensor, "b c p p"]]:
@@ -125,9 +125,13 @@ def orientations(values: Float[Tensor, "b c p p"], half_strength: float) -> Floa
     Of cells of two pixels: means.
     """
     dx, dy = gradients(values)
-    square = dx.square() + dy.square()
-    most = square.argmax(1, keepdim=True)
-    x, y, square = (planes.gather(1, most) for planes in (dx, dy, square))
+    x, y = dx[:, :1], dy[:, :1]
+    square = x.square() + y.square()
+    for i in range(1, values.shape[1]):  # argmax over channels that lie apart in memory takes several times as long
+        other_x, other_y = dx[:, i : i + 1], dy[:, i : i + 1]
+        other = other_x.square() + other_y.square()
+        more = other > square
+        x, y, square = torch.where(more, other_x, x), torch.where(more, other_y, y), torch.where(more, other, square)
     weight = square / (square + half_strength**2) / (square + 1e-3)
     return avg_pool2d(torch.cat(((x * x - y * y) * weight, 2 * x * y * weight), 1), 2)
 
