@@ -19,7 +19,7 @@ from refinenet.methods import BASELINES
 from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, shown, typed, words
 
 TUG, BOBBIN = (ROOT / "examples" / "objects" / f"{name}.ply" for name in ("tug", "bobbin"))
-SHIPPED = ROOT / "examples" / "checkpoints" / "tug_compact.safetensors"
+CHECKPOINTS = ROOT / "examples" / "checkpoints"
 NEED_DEPTH = ("depth-icp",)
 ON_GPUS = "--device auto"
 HYPOTHESES_PER_SCENE = 8
@@ -94,6 +94,13 @@ class Network:
     pairs: str = ""
     share: int = 1
     checkpoint: Path | None = None
+
+
+SHIPPED = {
+    "shipped": Network(checkpoint=CHECKPOINTS / "tug_compact.safetensors"),
+    "shipped-flow": Network(checkpoint=CHECKPOINTS / "tug_flow.safetensors"),
+}
+"""Networks of the example object that need no training: presets `compact` and `flow`."""
 
 
 def small_networks(options: str, names: tuple[str, ...]) -> dict[str, Network]:

@@ -8,7 +8,7 @@ errors in x, y and z of 9.75, 9.33 and 71.09 mm become 4.9, 5.87 and 42.69 mm.
 Here test images are rendered, scenes that no network was trained on. Starts are the truth, turned by 0 to 56 degrees,
 28 in the mean like SSD-6D's, and moved by 0 to 0.3 diameters in any direction; SSD-6D's errors lie mostly in depth.
 
-  --smoke  the example object, its shipped checkpoint, 2 images: a test of the plumbing
+  --smoke  the example object, its shipped checkpoints, 2 images: a test of the plumbing
   --small  the same with 60 images; nothing is trained, and starts go beyond what this checkpoint was trained for
   --full   LM-O's meshes (--data), a network of preset paper for each loss and object as in the paper, 200 000
            path-traced pairs each, 100 images an object; a GPU
@@ -29,7 +29,6 @@ from experiments.common import (
     Comparison,
     Experiment,
     Inputs,
-    Network,
     compared,
     full_networks,
     lmo_meshes,
@@ -59,7 +58,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             objects=f"--object {quoted(TUG)}",
             scenes=f"--preset linemod --engine raster {inputs.behind()}",
             frames=FRAMES[size],
-            networks={"shipped": Network(checkpoint=SHIPPED)},
+            networks=SHIPPED,
             starts=STARTS,
         )
     return compared(work, what)

@@ -8,7 +8,7 @@ that diverged (more than 45 degrees or half a diameter away at the end). The pap
 
 Here test images are rendered, scenes that no network was trained on.
 
-  --smoke  the example object, its shipped checkpoint, 1 image, 3 starts: a test of the plumbing
+  --smoke  the example object, its shipped checkpoints, 1 image, 3 starts: a test of the plumbing
   --small  the same with 24 images; nothing is trained
   --full   LM-O's meshes (--data), a network of preset paper for each loss and object as in the paper, 200 000
            path-traced pairs each, 100 images an object; a GPU
@@ -31,7 +31,6 @@ from experiments.common import (
     Comparison,
     Experiment,
     Inputs,
-    Network,
     compared,
     full_networks,
     lmo_meshes,
@@ -67,7 +66,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             objects=f"--object {quoted(TUG)}",
             scenes=f"--preset quickstart --engine raster {inputs.behind()}",
             frames=FRAMES[size],
-            networks={"shipped": Network(checkpoint=SHIPPED)},
+            networks=SHIPPED,
             starts="--angles 15,45 --translations 0.2" if size == "smoke" else PROTOCOL,
             iterations=10,
         ),

@@ -27,10 +27,10 @@ UNTRAINED = "--steps 2 --batch 4 --set validation.pairs=4 --set loader.workers=1
 
 def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
-    networks = {"compact": Network(checkpoint=SHIPPED)}
+    networks = {"compact": SHIPPED["shipped"], "flow": SHIPPED["shipped-flow"]}
     if size != "smoke":
         networks["paper"] = Network(train=f"--preset paper --set backbone.pretrained=false {UNTRAINED}")
-        networks |= {name: Network(train=f"--preset {name} {UNTRAINED}") for name in ("plus", "flow")}
+        networks["plus"] = Network(train=f"--preset plus {UNTRAINED}")
     return compared(
         work,
         Comparison(

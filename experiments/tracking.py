@@ -8,7 +8,7 @@ Here sequences are rendered. The first frame starts from the truth turned by up 
 diameters; so does a later one whose object was lost in the frames before, which is counted as a reset. Those perturbed
 poses of all frames are the row `start` of the report; a tracker sees no other of them.
 
-  --smoke  the example object, its shipped checkpoint, 1 sequence of 6 images: a test of the plumbing
+  --smoke  the example object, its shipped checkpoints, 1 sequence of 6 images: a test of the plumbing
   --small  the same with 2 sequences of 100 images; nothing is trained
   --full   tug and bobbin, 4 sequences of 1 000 images, one network of preset paper for each loss, 200 000 path-traced
            pairs; a GPU
@@ -32,7 +32,6 @@ from experiments.common import (
     Comparison,
     Experiment,
     Inputs,
-    Network,
     full_networks,
     joined,
     main,
@@ -54,7 +53,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
         objects=both if full else f"--object {quoted(TUG)}",
         scenes=f"--preset choi --engine {'cycles' if full else 'raster'} {inputs.behind()}",
         pairs=200_000,
-        networks=full_networks(inputs) if full else {"shipped": Network(checkpoint=SHIPPED)},
+        networks=full_networks(inputs) if full else SHIPPED,
         workers=8 if full else 2,
         render=ON_GPUS if full else "--workers 2",
     )

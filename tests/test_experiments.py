@@ -201,7 +201,7 @@ def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     assert first.returncode == 0, first.stdout + first.stderr
     result = json.loads((tmp_path / "work" / "result.json").read_text())
     assert (tmp_path / "work" / "report" / "index.html").is_file()
-    assert set(result["methods"]) == {"start", "shipped", *common.BASELINES}
+    assert set(result["methods"]) == {"start", *common.SHIPPED, *common.BASELINES}
     assert result["methods"]["start"]["vss_mean"] < result["methods"]["shipped"]["vss_mean"]
     levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
     assert levels[-1] == 45
@@ -213,7 +213,7 @@ def test_every_method_starts_from_the_same_poses_and_is_in_the_report(tmp_path) 
         objects="--object a.ply",
         scenes="",
         frames=2,
-        networks={"net": common.Network(checkpoint=common.SHIPPED)},
+        networks={"net": common.SHIPPED["shipped"]},
         baselines=("edge-icp",),
         starts="--angles 5",
     )

@@ -6,6 +6,7 @@ import threading
 
 import pytest
 from posecore.shard import ShardReader
+from refinenet.config import load_config
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 from .test_data import split_by_scene
@@ -34,6 +35,15 @@ def test_train_command(cli, dataset, tmp_path):
     assert cli("train", dataset, "--out", out, *SMALL, "--resume").exit_code == 0
 
 
+def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
+    """One more option at the end of a command turns a switch off; and pools of a fixed network read their ranges."""
+    on = ["own_predictions.share=0.5", "own_predictions.updates=2", "network.confidence=true"]
+    off = ["own_predictions.share=0", "network.confidence=false", "loss.confidence_weight=2"]
+    assert load_config("compact", [*on, *off]).own_predictions.updates == 2
+    assert not load_config("compact", ["hypothesis.in_plane=false", "hypothesis.fresh=false"]).hypothesis.fresh
+    assert load_config("paper", ["hypothesis.max_angle_deg=40"]).hypothesis.max_angle_deg == 40
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
@@ -43,14 +53,13 @@ def test_train_command(cli, dataset, tmp_path):
         (["--set", "loss.min_closeness=0.1"], 2, "which this network has not: set network.confidence=true"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
         (
-            ["--set", "hypothesis.fresh=false", "--set", "hypothesis.max_angle_deg=40"],
+            ["--preset", "paper", "--set", "hypothesis.in_plane=true"],
             2,
-            "hypothesis.max_angle_deg changes nothing here: it needs hypothesis.fresh=true",
+            "hypothesis.in_plane changes nothing here: it needs hypothesis.fresh=true",
         ),
         (["--backbone-weights", "stem.safetensors"], 2, "network.backbone.weights changes nothing here"),
-        (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share above 0"),
+        (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share=0.5 or so"),
         (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
-        (["--set", "loader.prefetch=2"], 2, "it needs loader.workers above 0"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
         (["--set", "optimiser.lr=.inf"], 2, "lr is inf"),
         (["--set", "optimiser.gradient_clip=-1"], 2, "gradient_clip is -1"),

@@ -172,9 +172,10 @@ def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
         (["--checkpoint", trained, *rest, "--object", "5"], 2, "no pose of object 5"),
         (["--checkpoint", trained, *rest, "--hypotheses", 4, "--scorer", "learned"], 1, "no confidence output"),
         (["--checkpoint", trained, "--dataset", tmp_path / "no", *rest[2:]], 1, "no such folder"),
-        (["--checkpoint", trained, *rest, "--scorer", "none"], 2, "--scorer does nothing without --hypotheses above 1"),
-        (["--checkpoint", trained, *rest, "--seed", 1], 2, "--seed does nothing without --hypotheses above 1"),
-        (["--method", "region", *rest, "--batch", 8], 2, "--batch does nothing without a --checkpoint"),
+        (["--checkpoint", trained, *rest, "--scorer", "none"], 2, "--scorer does nothing with one hypothesis, see --h"),
+        (["--checkpoint", trained, *rest, "--seed", 1], 2, "--seed does nothing with one hypothesis"),
+        (["--method", "region", *rest, "--batch", 8], 2, "--batch does nothing for --method region without a network"),
+        (["--method", "search", *rest, "--seed", 8], 2, "--seed does nothing for --method search: leave it out"),
     ):
         result = cli("refine", *arguments)
         assert result.exit_code == code, result.output

@@ -12,9 +12,10 @@ import fsspec
 import numpy as np
 import pytest
 import torch
-from posecore.errors import ShardError
+from posecore.errors import CheckpointError, ConfigError, ShardError, StorageError
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
+from refinenet import checkpoint
 from refinenet.config import load_config
 from refinenet.data import PairStream, make_loader
 from refinenet.growth import Growth
@@ -118,7 +119,7 @@ def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, mo
     with caplog.at_level(logging.WARNING):
         train(small("loader.follow=true", "steps=30", "batch=4"), str(url), tmp_path / "run")
     rendering.join()
-    assert "0 shards, waiting for 1" in caplog.text
+    assert "there are 0 of 1 shards to train on, 0 of 1 scene to hold out" in caplog.text
     joined = [json.loads(path.read_text())["shards"] for path in sorted((tmp_path / "run/growth").iterdir())]
     assert any(joined)
     held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
@@ -144,22 +145,52 @@ def test_later_shards_bring_held_out_pairs_until_there_are_enough(growing, tmp_p
     assert ids(run) == ids(enough) == first
     run.save(run.validate())
     assert run.validate()["validation/pairs"] == 4
-    best_mm = run.best_mm
-    assert best_mm < math.inf
+    assert run.best_mm < math.inf
     reveal(6)
     for each in (run, enough):
         batches = each.stream()
         while not (each.out / "growth").is_dir():
             each.take_step(next(batches))
+        before = each.best_mm
         each.validate()
+        assert each.best_mm == (math.inf if each is run else before)  # others are measured now, or the same
+        each.save(each.validate())
     assert ids(run) == [*first, (3, 2), (3, 3)]
     assert ids(enough) == first
-    assert run.best_mm == math.inf  # was measured on other pairs
+    for each, pairs in ((run, 64), (enough, 4)):
+        resumed = trainer(each.out.name, f"validation.pairs={pairs}", resume=True)
+        assert ids(resumed) == ids(each)
+        assert resumed.best_mm == each.best_mm < math.inf
+        assert resumed.validate() == each.validate()
+
+
+def test_a_run_that_an_earlier_version_began_does_not_follow_on(growing, tmp_path, monkeypatch):
+    """It trained on scenes that would be held out now."""
+    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "batch=4"]
+    run = Trainer(small(*options), str(growing[0]), tmp_path)
+    run.save(None)
+    state = checkpoint.load_state(tmp_path, 0)
+    del state["held_out_shards"]
+    monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state)
+    with pytest.raises(CheckpointError, match="of an earlier version, which held out less; start a new run"):
+        Trainer(small(*options), str(growing[0]), tmp_path, resume=True)
+
+
+def test_a_resumed_run_measures_what_it_did_before_others_joined(growing, tmp_path):
+    """Killed after an epoch with new shards began and before they were measured."""
+    url, reveal = growing
+    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "validation.pairs=64", "batch=4"]
+    run = Trainer(small(*options), str(url), tmp_path)
     run.save(run.validate())
-    resumed = trainer("run", "validation.pairs=64", resume=True)
-    assert ids(resumed) == ids(run)
-    assert resumed.best_mm == run.best_mm < math.inf
-    assert resumed.validate() == run.validate()
+    reveal(6)
+    batches = run.stream()
+    while not (tmp_path / "growth").is_dir():
+        next(batches)
+    resumed = Trainer(small(*options), str(url), tmp_path, resume=True)
+    assert sum(len(batch.sample_ids) for batch in resumed._held_out.batches) == 4
+    assert resumed.best_mm == run.best_mm
+    assert resumed.validate()["validation/pairs"] == 6
+    assert resumed.best_mm == math.inf
 
 
 def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, monkeypatch, caplog):
@@ -175,18 +206,34 @@ def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, m
     assert f"{later}: no dataset here yet, waiting for one" in caplog.text
 
 
-def test_training_waits_for_scenes_on_both_sides(growing, tmp_path, monkeypatch, caplog):
-    """Seed 2 draws out scene 6 first, which comes with the second shard."""
+def test_waiting_for_a_dataset_where_a_file_stands_is_an_error(tmp_path):
+    (tmp_path / "shards").write_text("no folder")
+    with pytest.raises(StorageError, match="shards: is a file, expected a folder"):
+        Trainer(small("loader.follow=true"), str(tmp_path / "shards"), tmp_path / "run")
+
+
+def test_an_unknown_object_is_not_waited_for(growing, tmp_path):
+    with pytest.raises(ConfigError, match="there is no object 99 in it, only 1"):
+        Trainer(small("loader.follow=true", "objects=[99]"), str(growing[0]), tmp_path / "run")
+
+
+def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(growing, tmp_path, monkeypatch, caplog):
+    """Seed 2 draws out scene 6 first, which comes with the second shard; there are two loader processes to feed."""
     url, reveal = growing
     monkeypatch.setattr("refinenet.growth.POLL_S", 0.05)
-    assert drawn_out(np.arange(8), 0.1, 2).tolist() == [6]
+    assert drawn_out(np.arange(12), 0.1, 2).tolist() == [6]
     reveal(1)
-    later = threading.Timer(0.5, lambda: reveal(2))
-    later.start()
+    later = [threading.Timer(0.4, lambda: reveal(2)), threading.Timer(0.8, lambda: reveal(3))]
+    for timer in later:
+        timer.start()
+    options = ["loader.follow=true", "validation.scene_share=0.1", "seed=2", "loader.workers=3"]
     with caplog.at_level(logging.WARNING):
-        Trainer(small("loader.follow=true", "validation.scene_share=0.1", "seed=2"), str(url), tmp_path / "run")
-    later.join()
-    assert "0 of 4 scenes are held out, waiting for more scenes" in caplog.text
+        run = Trainer(small(*options), str(url), tmp_path / "run")
+    for timer in later:
+        timer.join()
+    assert "there are 1 of 3 shards to train on, 0 of 1 scene to hold out" in caplog.text
+    assert "there are 2 of 3 shards to train on, 1 of 1 scene to hold out" in caplog.text
+    assert set(run.training.rows) == {0, 1, 2}
 
 
 def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):

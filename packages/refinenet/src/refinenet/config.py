@@ -452,25 +452,29 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
 def _require_used(config: TrainConfig, keys: Sequence[str]) -> None:
     """Refuse keys that someone set by hand and that change nothing under the rest of the configuration.
 
+    Those of a switch that was turned off by hand as well may stand: so one option added to a command does that.
+
     Raises:
         ConfigError: There is one; it and what it needs are named.
     """
-    loss, stem = config.loss.name, "network.kind=paper"
-    drawn = ("max_angle_deg", "max_translation_diameter", "depth_stretch", "easy_share", "any_twin", "in_plane")
-    unused = {
-        "hypothesis.fresh=true": [] if config.hypothesis.fresh else [f"hypothesis.{name}" for name in drawn],
-        stem: [] if config.network.kind == "paper" else ["network.backbone.", "network.branch_channels"],
-        "window.kind=diameter": [] if config.window.kind == "diameter" else ["window.scale"],
-        "loss.name=mse": [] if loss == "mse" else ["loss.gamma"],
-        "a loss with point in its name": [] if "point" in loss else ["loss.rotation_weight", "loss.model_points"],
-        "loss.name=contour+point": [] if "+point" in loss else ["loss.point_weight"],
-        "network.confidence=true": [] if config.network.confidence else ["loss.confidence_"],
-        "own_predictions.share above 0": [] if config.own_predictions.share else ["own_predictions."],
-        "loader.workers above 0": [] if config.loader.workers else ["loader.prefetch"],
+    loss = config.loss.name
+    switches = {
+        "hypothesis.fresh=true": (config.hypothesis.fresh, ["hypothesis.any_twin", "hypothesis.in_plane"]),
+        "network.confidence=true": (config.network.confidence, ["loss.confidence_"]),
+        "own_predictions.share=0.5 or so": (config.own_predictions.share, ["own_predictions."]),
+        "loader.workers=1 or more": (config.loader.workers, ["loader.prefetch"]),
     }
-    for needed, names in unused.items():
-        for key in keys:
+    choices = {
+        "network.kind=paper": (config.network.kind == "paper", ["network.backbone.", "network.branch_channels"]),
+        "window.kind=diameter": (config.window.kind == "diameter", ["window.scale"]),
+        "loss.name=mse": (loss == "mse", ["loss.gamma"]),
+        "loss.name=point, contour+point or flow+point": ("point" in loss, ["loss.rotation_weight"]),
+        "loss.name=contour+point or flow+point": ("+point" in loss, ["loss.point_weight"]),
+    }
+    off_by_hand = {needed for needed in switches if needed.partition("=")[0] in keys}
+    for needed, (met, names) in (switches | choices).items():
+        for key in keys if not met and needed not in off_by_hand else ():
             _require(
-                not key.startswith(tuple(names)) or key == "own_predictions.share",
+                not key.startswith(tuple(names)),
                 f"{key} changes nothing here: it needs {needed}; leave it out, or set that as well",
             )

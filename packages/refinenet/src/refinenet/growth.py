@@ -10,7 +10,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from posecore.shard import GROUP, ShardReader, n_shards
 from posecore.store import open_store
 
 from refinenet.config import TrainConfig
-from refinenet.split import GROWTH, DataRecord, Split, both_sides, divide, drawn_out, read_scenes, scenes_in
+from refinenet.split import GROWTH, DataRecord, Split, divide, drawn_out, read_scenes, scenes_in
 
 Array = np.ndarray
 POLL_S = 2.0
@@ -68,16 +68,17 @@ class Growth:
             if found["complete"]:
                 return
 
-    def held_out(self, url: str, known: set[int]) -> tuple[set[int], dict[int, Array]]:
-        """Shards beside the known ones that have joined in epochs begun so far, and held-out rows by shard.
+    def joined(self) -> set[int]:
+        """Shards that have joined in epochs begun so far."""
+        begun = (self.out / GROWTH).glob("epoch-*.json")
+        return {shard for path in begun for shard in json.loads(path.read_text())["shards"]}
+
+    def held_out(self, url: str, shards: Collection[int]) -> tuple[set[int], dict[int, Array]]:
+        """Those of some shards that can be read, and their held-out rows by shard.
 
         Raises:
             ShardError: As `epochs`.
         """
-        begun = (self.out / GROWTH).glob("epoch-*.json")
-        shards = {shard for path in begun for shard in json.loads(path.read_text())["shards"]} - known
-        if not shards:
-            return set(), {}
         scene_of = self._scenes(ShardReader(url), sorted(shards))
         return set(scene_of), self._divide(scene_of)[1].rows
 
@@ -92,38 +93,43 @@ class Growth:
         return divide(scene_of, np.union1d(self.record.held_out, drawn))
 
 
-def wait_for_start(url: str, config: TrainConfig, wanted: int) -> None:
+def wait_for_dataset(url: str) -> None:
+    """Wait until whoever renders a dataset has begun it.
+
+    Raises:
+        StorageError: A file stands in its place.
+    """
+    store, told = open_store(url), False
+    while store.get(GROUP) is None:
+        store.list_names()  # raises for a file, in which nothing will ever be
+        if not told:
+            log.warning("%s: no dataset here yet, waiting for one; Ctrl-C ends that", url)
+            told = True
+        time.sleep(POLL_S)
+
+
+def wait_for_start(reader: ShardReader, config: TrainConfig, wanted: int) -> None:
     """Wait until a growing dataset has enough to begin with, or all it will ever have.
 
-    That is a number of shards, one for each loader process, and scenes on both sides of the split.
+    That is a number of shards to train on, one for each loader process, and a scene that is held out.
 
     Raises:
         ShardError: A shard cannot be read and `loader.skip_bad_shards` is off.
     """
-    told = set[str]()
-
-    def wait(found: str, lacking: str) -> None:
-        if lacking not in told:
-            log.warning("%s: %s, waiting for %s", url, found, lacking)
-            told.add(lacking)
-        time.sleep(POLL_S)
-
-    store = open_store(url)
-    while store.get(GROUP) is None:
-        wait("no dataset here yet", "one")
-    reader, share, seed = ShardReader(url), config.validation.scene_share, config.seed
-    scenes, looked_at = np.array([], np.int64), set[int]()
+    scene_of: dict[int, Array] = {}
+    told = ""
     while not reader.complete:
-        new = sorted({*reader.committed} - looked_at)
-        looked_at |= set(new)
-        found, _ = read_scenes(reader, new, skip=config.loader.skip_bad_shards, objects=config.objects)
-        scenes = np.union1d(scenes, scenes_in(found))
-        if len(looked_at) < wanted:
-            wait(f"{len(looked_at)} shards", str(wanted))
-        elif not both_sides(scenes, share, seed):
-            wait(f"{len(drawn_out(scenes, share, seed))} of {len(scenes)} scenes are held out", "more scenes")
-        else:
+        new = sorted({*reader.committed} - set(scene_of))
+        scene_of |= read_scenes(reader, new, skip=config.loader.skip_bad_shards, objects=config.objects)[0]
+        drawn = drawn_out(scenes_in(scene_of), config.validation.scene_share, config.seed)
+        training, held = divide(scene_of, drawn)
+        if len(training.rows) >= wanted and held.scenes:
             return
+        lacking = f"{len(training.rows)} of {wanted} shards to train on, {held.scenes} of 1 scene to hold out"
+        if lacking != told:
+            log.warning("%s: waiting, there are %s", reader.url, lacking)
+            told = lacking
+        time.sleep(POLL_S)
         reader.refresh()
 
 

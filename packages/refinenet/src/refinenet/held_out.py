@@ -1,6 +1,6 @@
 """Pairs of held-out scenes: made once and kept, so that the same are measured every time."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 from posecore.errors import ShardError
@@ -21,28 +21,27 @@ class HeldOut:
         config: Of the run.
         split: Held-out rows of the shards that the run began with.
         growth: Knows which shards have joined since; None where none can.
+        joined: Those that had been taken in when a resumed run was saved.
 
     Attributes:
         batches: Of pairs.
+        joined: Shards that have been taken in since the run began.
         skipped: What is wrong with shards that cannot be read.
 
     Raises:
         ShardError: None can be read.
     """
 
-    def __init__(self, url: str, config: TrainConfig, split: Split, growth: Growth | None) -> None:
+    def __init__(
+        self, url: str, config: TrainConfig, split: Split, growth: Growth | None, joined: Collection[int] = ()
+    ) -> None:
         self._url, self._config, self._growth = url, config, growth
         self._rows = dict(split.rows)
-        self._joined: set[int] = set()
+        self.joined: set[int] = set()
         self.batches: list[Batch] = []
         self.skipped: tuple[str, ...] = ()
-        if not self.grow():
-            self._make()
-
-    @property
-    def pairs(self) -> int:
-        """How many are measured."""
-        return sum(len(batch.sample_ids) for batch in self.batches)
+        self._take_in(joined)
+        self._make()
 
     def grow(self) -> bool:
         """Take in what has joined since; whether anything did, so that errors before and after do not compare.
@@ -50,15 +49,21 @@ class HeldOut:
         Raises:
             ShardError: A shard that joined cannot be read.
         """
-        if self._growth is None or self.pairs >= self._config.validation.pairs:
+        if self._growth is None or sum(map(len, self._rows.values())) >= self._config.validation.pairs:
             return False
-        shards, rows = self._growth.held_out(self._url, self._joined)
-        self._joined |= shards
-        if not rows:
+        grown = self._take_in(self._growth.joined() - self.joined)
+        if grown:
+            self._make()
+        return grown
+
+    def _take_in(self, shards: Collection[int]) -> bool:
+        """Whether any of these shards has held-out rows."""
+        if self._growth is None or not shards:
             return False
+        read, rows = self._growth.held_out(self._url, shards)
+        self.joined |= read
         self._rows |= rows
-        self._make()
-        return True
+        return bool(rows)
 
     def _make(self) -> None:
         source = PairSource(self._url, self._config, training=False)

@@ -131,8 +131,9 @@ def held_out_scenes(
     scenes = scenes_in(scene_of)
     if len(scenes) < 2:
         raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
-    if growing and both_sides(scenes, share, seed):
-        return drawn_out(scenes, share, seed)
+    drawn = drawn_out(scenes, share, seed)
+    if growing and 0 < len(drawn) < len(scenes):
+        return drawn
     held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
     return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held])
 
@@ -141,11 +142,6 @@ def drawn_out(scenes: Array, share: float, seed: int) -> Array:
     """Scenes of a growing dataset that are held out: each is drawn by itself, with probability `share`."""
     draws = [np.random.default_rng([seed, SPLIT, int(scene)]).random() for scene in scenes]
     return np.asarray(scenes[np.array(draws) < share])
-
-
-def both_sides(scenes: Array, share: float, seed: int) -> bool:
-    """Whether `drawn_out` leaves scenes to train on and scenes to measure on."""
-    return 0 < len(drawn_out(scenes, share, seed)) < len(scenes)
 
 
 def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tuple[Split, Split]:

@@ -23,7 +23,7 @@ from refinenet.config import TrainConfig
 from refinenet.data import Batch, PairStream, make_loader, on_device
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
-from refinenet.growth import Growth, wait_for_start
+from refinenet.growth import Growth, wait_for_dataset, wait_for_start
 from refinenet.held_out import HeldOut
 from refinenet.loss import PIXEL_LOSSES, make_loss
 from refinenet.network import Pair, PaperNet, make_network
@@ -88,15 +88,23 @@ class Trainer:
         self.skipped: dict[str, None] = {}
         last = self._last() if resume else None
         if config.loader.follow and not resume:
-            # every rank for itself: one that waited for another's word would give up after some minutes
-            wait_for_start(url, config, self.world * max(1, config.loader.workers))
+            wait_for_dataset(url)
         reader = ShardReader(url)
         if unknown := set(config.objects) - {*object_ids(reader)}:
             known = ", ".join(map(str, object_ids(reader)))
             raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {known}; choose among those")
+        if config.loader.follow and not resume:
+            # every rank for itself: one that waited for another's word would give up after some minutes
+            wait_for_start(reader, config, self.world * max(1, config.loader.workers))
+        state = None if last is None else checkpoint.load_state(out, last.provenance.step)
+        if state is not None and config.loader.follow and "held_out_shards" not in state:
+            raise CheckpointError(
+                f"{out}: a run with --follow of an earlier version, which held out less; start a new run"
+            )
         self.training, held_out, record = self._split(reader, resume=resume)
         self._growth = Growth(out=out, record=record, config=config) if config.loader.follow else None
-        self._held_out = HeldOut(url, config, held_out, self._growth) if self.rank == 0 else None
+        joined = [] if state is None else state.get("held_out_shards", [])
+        self._held_out = HeldOut(url, config, held_out, self._growth, joined) if self.rank == 0 else None
         self._tell_skipped(*(self._held_out.skipped if self._held_out else ()))
         meshes = load_meshes(reader)
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
@@ -133,8 +141,8 @@ class Trainer:
             checkpoint.load(Path(config.init)).give_weights(self.network)
         decay = config.optimiser.ema_decay
         self._average = RunningAverage(self.network, decay) if decay else None
-        if last is not None:
-            self._resume(last)
+        if last is not None and state is not None:
+            self._resume(last, state)
         self._parallel = self._distribute()
         self._forward = torch.compile(self._parallel) if config.compile else self._parallel
 
@@ -188,10 +196,9 @@ class Trainer:
                 self.skipped[message] = None
                 log.warning("skipped: %s", message)
 
-    def _resume(self, last: checkpoint.Checkpoint) -> None:
+    def _resume(self, last: checkpoint.Checkpoint, state: dict[str, Any]) -> None:
         if last.provenance.dataset_sha256 != self._dataset_sha256:
             raise CheckpointError(f"{last.path}: was trained on other data than {self._url}; start a new run")
-        state = checkpoint.load_state(self.out, last.provenance.step)
         if state["world"] != self.world:
             raise ConfigError(
                 f"{last.path}: was trained by {state['world']} processes and now there are {self.world}; resume with "
@@ -201,9 +208,7 @@ class Trainer:
         if self._average is not None:
             self._average.network.load_state_dict(last.tensors)
         self._optimiser.load_state_dict(state["optimiser"])
-        self.step = last.provenance.step
-        if self._held_out is not None and state["held_out_pairs"] == self._held_out.pairs:
-            self.best_mm = float(state["best_mm"])
+        self.step, self.best_mm = last.provenance.step, float(state["best_mm"])
         if self.rank == 0:
             checkpoint.drop_leftovers(self.out, self.step)
 
@@ -335,7 +340,7 @@ class Trainer:
         assert self._held_out is not None
         state = {
             "optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm, "world": self.world,
-            "held_out_pairs": self._held_out.pairs,
+            "held_out_shards": sorted(self._held_out.joined),
         }  # fmt: skip
         if self._average is not None:
             state["weights"] = self.network.state_dict()

@@ -21,11 +21,12 @@ def start_logging(verbose: bool) -> None:
 
 @contextmanager
 def stoppable(where: Path) -> Iterator[None]:
-    """Ctrl-C ends with one line."""
+    """Ctrl-C ends with one line; what there is then is in this folder, if anything."""
     try:
         yield
     except KeyboardInterrupt:
-        click.echo(f"Stopped; what was finished is in {where}", err=True)
+        what = f"what was finished is in {where}" if where.exists() else "nothing was finished, nothing is written"
+        click.echo(f"Stopped; {what}", err=True)
         raise SystemExit(130) from None
 
 

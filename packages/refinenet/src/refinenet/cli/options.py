@@ -46,13 +46,13 @@ def require_apart(read: Mapping[str, Path | None], written: Mapping[str, Path | 
             raise click.UsageError(f"{name} and {other} are both {path}: name two files")
 
 
-def require_used(needs: str, *names: str) -> None:
-    """Refuse options of this command that were given and would do nothing, for what they need is not there."""
+def require_used(why: str, *names: str) -> None:
+    """Refuse options of this command that were given and do nothing, and say why: `without ...`, `with ...`."""
     context = click.get_current_context()
     for option in context.command.params:
         given = context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
         if option.name in names and given:
-            raise click.UsageError(f"{option.opts[-1]} does nothing without {needs}: leave it out")
+            raise click.UsageError(f"{option.opts[-1]} does nothing {why}: leave it out")
 
 
 def require_fit(method: str, checkpoint: Path | None, with_network: Sequence[str] = ()) -> None:
@@ -64,4 +64,4 @@ def require_fit(method: str, checkpoint: Path | None, with_network: Sequence[str
         needs = "needs a --checkpoint" if checkpoint is None else "takes no --checkpoint"
         raise click.UsageError(f"--method {method} {needs}")
     if checkpoint is None:
-        require_used("a --checkpoint", "device", "batch", "allow_other_mesh")
+        require_used(f"for --method {method} without a network", "device", "batch", "allow_other_mesh")

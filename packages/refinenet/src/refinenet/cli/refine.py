@@ -109,8 +109,10 @@ def refine(
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
+    if method != NETWORK:
+        require_used(f"for --method {method}", "scorer", "seed")
     if hypotheses == 1:
-        require_used("--hypotheses above 1", "scorer", "seed")
+        require_used("with one hypothesis, see --hypotheses", "scorer", "seed")
     if min_confidence is not None and method not in WITH_CONFIDENCE:
         raise click.UsageError(
             f"--min-confidence is for --method {' and '.join(WITH_CONFIDENCE)}, {method} tells no confidence"

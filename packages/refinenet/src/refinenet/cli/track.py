@@ -3,6 +3,7 @@
 import re
 from collections import Counter
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +68,7 @@ SHOWN_REASONS = 3
 @click.option(
     "--depth-step", type=click.FloatRange(0, 0.5, max_open=True),
     help="Also try each pose nearer and farther by this share of its depth; 0 is faster, and depth may drift. "
-    "[0.02; 0 for a method without confidences]",
+    "[0.02; 0 for preset flow and for a method without confidences]",
 )  # fmt: skip
 @click.option("--video", type=NEW_FILE, metavar="FILE", help="Write a video (.mp4, .avi) with contours and states.")
 @click.option("--fps", type=click.FloatRange(0.1), default=30.0, help="Frames a second of --video.")
@@ -119,7 +120,7 @@ def track(
     start_logging(verbose)
     require_fit(method, checkpoint)
     if video is None:
-        require_used("--video", "fps")
+        require_used("without --video", "fps")
     if (init is None) == (pose is None):
         raise click.UsageError("give either --init or --pose: where the objects are at the start")
     require_apart(
@@ -161,6 +162,8 @@ def track(
     else:
         refiner = Refiner(loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh)
         usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
+        if loaded.provenance.config.network.kind == "flow":
+            usual = replace(usual, depth_step=0.0)  # it corrects depth by itself
     with closing(refiner), progress_bar(quiet) as bar:
         config = TrackingConfig(
             sure=usual.sure if sure is None else sure,
