@@ -122,13 +122,14 @@ def test_promises_are_kept_or_missed_by_the_reports_numbers() -> None:
     assert not all(promise.kept for promise in quickstart().promises(summary_with(0.1, 0.4, 0.7, missing=1)))
 
 
-def test_the_shipped_checkpoint_loads_and_is_of_the_example_object(repository, tug_ply):
+@pytest.mark.parametrize(("preset", "steps"), [("compact", 16000), ("flow", 6000)])
+def test_the_shipped_checkpoints_load_and_are_of_the_example_object(repository, tug_ply, preset, steps):
     from posecore.mesh import load_mesh, mesh_digest
     from refinenet import checkpoint
 
-    loaded = checkpoint.load(repository / "examples" / "checkpoints" / "tug_compact.safetensors", "compact")
+    loaded = checkpoint.load(repository / "examples" / "checkpoints" / f"tug_{preset}.safetensors", preset)
     loaded.network()
     (trained,) = loaded.provenance.objects.values()
     mesh = load_mesh(tug_ply)
     assert (trained["sha256"], trained["mesh_digest"]) == (mesh.sha256, mesh_digest(mesh))
-    assert loaded.provenance.step == 16000
+    assert loaded.provenance.step == steps

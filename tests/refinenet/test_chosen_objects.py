@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
 from refinenet.checkpoint import load
-from refinenet.growth import Growth
-from refinenet.split import OTHER_OBJECT, DataRecord, divide, held_out_scenes, read_scenes
+from refinenet.growth import Growth, wait_for_start
+from refinenet.split import OTHER_OBJECT, DataRecord, divide, drawn_out, held_out_scenes, read_scenes
 from refinenet.train import train
 from refinenet.trainer import Trainer
 
@@ -74,6 +75,27 @@ def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
     for shard, rows in joined.items():
         assert len(rows) == 4
         assert (reader.read(shard, ["obj_id"])["obj_id"][rows] == 1).all()
+
+
+def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_objects, tmp_path, monkeypatch):
+    """Of the first eight scenes seed 2 draws out the sixth, which shows object 1."""
+    copy = shutil.copytree(two_objects, tmp_path / "growing")
+    lines = (copy / "manifest.jsonl").read_text().splitlines(keepends=True)
+    (copy / "manifest.jsonl").write_text("".join(lines[:2]))
+    assert drawn_out(np.arange(8), 0.1, 2).tolist() == [6]
+    reader = ShardReader(str(copy))
+
+    class Waited(Exception):
+        pass
+
+    def wait(_):
+        raise Waited
+
+    monkeypatch.setattr("refinenet.growth.time.sleep", wait)
+    options = ["loader.follow=true", "seed=2", "validation.scene_share=0.1"]
+    wait_for_start(reader, small(*options, "objects=[1]"), 1)
+    with pytest.raises(Waited):
+        wait_for_start(reader, small(*options, "objects=[2]"), 1)
 
 
 def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):

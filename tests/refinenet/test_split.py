@@ -176,6 +176,15 @@ def test_a_run_that_an_earlier_version_began_does_not_follow_on(growing, tmp_pat
         Trainer(small(*options), str(growing[0]), tmp_path, resume=True)
 
 
+def test_a_new_run_forgets_what_had_joined_an_earlier_one(tmp_path):
+    earlier = tmp_path / "growth/epoch-000001.json"
+    earlier.parent.mkdir()
+    earlier.write_text('{"shards": [2], "complete": false}')
+    DataRecord(shards=(0, 1), held_out=HELD_OUT).save(tmp_path)
+    assert not earlier.exists()
+    assert DataRecord.load(tmp_path) == DataRecord(shards=(0, 1), held_out=HELD_OUT)
+
+
 def test_a_resumed_run_measures_what_it_did_before_others_joined(growing, tmp_path):
     """Killed after an epoch with new shards began and before they were measured."""
     url, reveal = growing
