@@ -4,6 +4,7 @@ import errno
 import itertools
 import json
 import logging
+import math
 import os
 import random
 import signal
@@ -100,6 +101,13 @@ def test_a_cosine_rate_that_jumps_on_resume_is_said(dataset, tmp_path, caplog):
     caplog.clear()
     Trainer(small(*options), str(dataset), tmp_path, resume=True).close()
     assert "jumps" not in caplog.text
+
+
+def test_a_best_of_other_pairs_is_forgotten(undisturbed, dataset):
+    same = Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+    other = Trainer(small(*AVERAGED, "validation.pairs=4"), str(dataset), undisturbed, resume=True)
+    assert same.best_mm < math.inf
+    assert other.best_mm == math.inf
 
 
 def test_what_a_killed_run_left_goes(undisturbed, dataset):

@@ -131,8 +131,7 @@ def held_out_scenes(
     scenes = scenes_in(scene_of)
     if len(scenes) < 2:
         raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
-    drawn = drawn_out(scenes, share, seed)
-    if growing and 0 < len(drawn) < len(scenes):
+    if growing and 0 < len(drawn := drawn_out(scenes, share, seed)) < len(scenes):
         return drawn
     held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
     return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held])

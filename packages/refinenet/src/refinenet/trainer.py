@@ -208,7 +208,9 @@ class Trainer:
         if self._average is not None:
             self._average.network.load_state_dict(last.tensors)
         self._optimiser.load_state_dict(state["optimiser"])
-        self.step, self.best_mm = last.provenance.step, float(state["best_mm"])
+        self.step = last.provenance.step
+        if last.provenance.config.validation.pairs == self.config.validation.pairs:  # else it was measured on others
+            self.best_mm = float(state["best_mm"])
         if self.rank == 0:
             checkpoint.drop_leftovers(self.out, self.step)
 
