@@ -4,6 +4,8 @@ import csv
 import itertools
 import json
 import shutil
+from contextlib import closing
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -31,7 +33,10 @@ from refinenet.baselines.search import GradientSearch
 from refinenet.config import load_config
 from refinenet.methods import Refinement, Status, make_baseline
 from refinenet.network import make_network
+from refinenet.refine import Refiner
 from refinenet.sequence import FileCamera, ImageFolder, VideoFile, VideoWriter
+from refinenet.tracker import Tracker, usual_config
+from refinenet.tracking import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNJUDGED_TRACKING
 
 from .conftest import HEIGHT_PX, WIDTH_PX, K, background
 
@@ -240,6 +245,19 @@ def test_the_shipped_flow_network_follows_a_turning_object(cli, repository, tug_
         assert np.rad2deg(se3.rotation_angle_rad(apart)) < 4
         assert np.abs(estimate.T_cam_obj[:2, 3] - truth[:2, 3]).max() < 0.02 * mesh.diameter_m
         assert abs(estimate.T_cam_obj[2, 3] - truth[2, 3]) < 0.15 * mesh.diameter_m
+
+
+def test_each_method_is_believed_by_its_own_rule(still, mesh, repository, tug_ply):
+    flow = repository / "examples" / "checkpoints" / "tug_flow.safetensors"
+    for made, usual in (
+        (Refiner.load(still, {1: mesh}), GRADIENT_TRACKING),
+        (Refiner.load(flow, {1: load_mesh(tug_ply)}), replace(LEARNED_TRACKING, depth_step=0.0)),
+        (make_baseline("search", {1: mesh}, 5), SEARCH_TRACKING),
+        (make_baseline("edge-icp", {1: mesh}, 5), UNJUDGED_TRACKING),
+    ):
+        with closing(made):
+            assert usual_config(made) == usual
+            assert Tracker(made, [1])._tracks[0].config == usual
 
 
 def test_names_with_numbers_are_in_their_order(tmp_path):

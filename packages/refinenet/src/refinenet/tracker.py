@@ -1,14 +1,20 @@
 """Tracking of objects through a sequence: each frame's poses start the next frame's refinement."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
 from posecore.symmetry import Symmetric
 
+from refinenet.baselines.search import GradientSearch
 from refinenet.methods import Frame, PoseRefiner, Refinement, Request
+from refinenet.refine import Refiner
 from refinenet.tracking import (
+    GRADIENT_TRACKING,
+    LEARNED_TRACKING,
+    SEARCH_TRACKING,
+    UNJUDGED_TRACKING,
     Sighting,
     Standing,
     TrackingConfig,
@@ -128,13 +134,22 @@ def _confidence(result: Refinement) -> float:
     return 1.0 if result.confidence is None else result.confidence
 
 
+def usual_config(refiner: PoseRefiner) -> TrackingConfig:
+    """When a pose of this method fits, where nobody says otherwise."""
+    if not isinstance(refiner, Refiner):
+        return SEARCH_TRACKING if isinstance(refiner, GradientSearch) else UNJUDGED_TRACKING
+    usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
+    corrects_depth = refiner.checkpoint.provenance.config.network.kind == "flow"
+    return replace(usual, depth_step=0.0) if corrects_depth else usual
+
+
 class Tracker:
     """Tracks one instance of each of several objects; all that a frame needs is refined together.
 
     Args:
         refiner: Method; stays open.
         obj_ids: Objects.
-        config: When a pose fits.
+        config: When a pose fits; `usual_config` by default.
         symmetries: By object id, of those that have any.
         motion: Whether poses are predicted with constant velocity.
 
@@ -146,13 +161,14 @@ class Tracker:
         self,
         refiner: PoseRefiner,
         obj_ids: Sequence[int],
-        config: TrackingConfig,
+        config: TrackingConfig | None = None,
         *,
         symmetries: Mapping[int, Symmetric] | None = None,
         motion: bool = False,
     ) -> None:
         self.refiner = refiner
         known = symmetries or {}
+        config = config or usual_config(refiner)
         self._tracks = [
             Track(obj_id=i, config=config, symmetries=known.get(i), motion=motion) for i in sorted(set(obj_ids))
         ]

@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,18 +132,12 @@ def track(
 
     from refinenet import __version__
     from refinenet import checkpoint as checkpoints
-    from refinenet.methods import WITH_CONFIDENCE, PoseRefiner, make_baseline
+    from refinenet.methods import PoseRefiner, make_baseline
     from refinenet.refine import Refiner
     from refinenet.sequence import BopScene, open_sequence
     from refinenet.track import TrackLog, track_sequence
-    from refinenet.tracker import Tracker
-    from refinenet.tracking import (
-        GRADIENT_TRACKING,
-        LEARNED_TRACKING,
-        SEARCH_TRACKING,
-        UNJUDGED_TRACKING,
-        TrackingConfig,
-    )
+    from refinenet.tracker import Tracker, usual_config
+    from refinenet.tracking import TrackingConfig
 
     if threads:
         torch.set_num_threads(threads)
@@ -158,13 +151,10 @@ def track(
     refiner: PoseRefiner
     if loaded is None:
         refiner = make_baseline(method, meshes, iterations)
-        usual = SEARCH_TRACKING if method in WITH_CONFIDENCE else UNJUDGED_TRACKING
     else:
         refiner = Refiner(loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh)
-        usual = LEARNED_TRACKING if refiner.scorer == "learned" else GRADIENT_TRACKING
-        if loaded.provenance.config.network.kind == "flow":
-            usual = replace(usual, depth_step=0.0)  # it corrects depth by itself
     with closing(refiner), progress_bar(quiet) as bar:
+        usual = usual_config(refiner)
         config = TrackingConfig(
             sure=usual.sure if sure is None else sure,
             found=usual.found if found is None else found,
