@@ -7,8 +7,8 @@ paper: about 25 ms on a GTX 1080.
 Weights do not matter for speed, so networks without a shipped checkpoint are trained for two steps only; their poses
 mean nothing.
 
-  --smoke  the shipped checkpoint, 2 images: a test of the plumbing
-  --small  the shipped checkpoint, presets paper, plus and flow, and the baselines, 30 images
+  --smoke  the shipped checkpoints (compact, flow), 2 images: a test of the plumbing
+  --small  the same, presets paper and plus, and the baselines, 30 images
   --full   the same with 200 images; a GPU
 
     python experiments/speed.py --small
