@@ -1,5 +1,7 @@
 """Tiny shard datasets made with the rasteriser, so that these tests need neither Blender nor synthgen."""
 
+import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -196,6 +198,24 @@ def bop(tmp_path, mesh, frame):
     sidecar = {"dataset": str(root), "method": "start", "perturbation": {"rows": [{"line": 2}]}}
     write_results(tmp_path / "start.csv", estimates, sidecar)
     return root, tmp_path / "start.csv"
+
+
+@pytest.fixture
+def two_images(bop, tmp_path):
+    """A dataset that has that image twice, four start poses, the first of them in the second image, and its file."""
+    root, start = bop
+    two = tmp_path / "two"
+    shutil.copytree(root, two)
+    for name in ("scene_camera.json", "scene_gt.json"):
+        file = two / "test" / "000001" / name
+        content = json.loads(file.read_text())
+        file.write_text(json.dumps({**content, "1": content["0"]}))
+    (picture,) = (two / "test" / "000001" / "rgb").iterdir()
+    second = picture.with_stem("000001")
+    shutil.copy(picture, second)
+    lines = start.read_text().splitlines()
+    start.write_text("\n".join([lines[0], lines[1].replace("1,0,1", "1,1,1", 1), *lines[1:]]) + "\n")
+    return two, start, second
 
 
 @pytest.fixture

@@ -15,6 +15,7 @@ from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.camera import Camera
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
+from posecore.processes import behave_as_worker
 from posecore.raster import Rasteriser
 
 from evalkit.files import load_result_files
@@ -228,6 +229,7 @@ _worker: Scorer | None = None
 
 def _start_worker(root: Path, split: str, sensor: str | None, vss: VssKind, with_vsd: bool) -> None:
     global _worker
+    behave_as_worker()
     _worker = Scorer(BopDataset(root, split, sensor), visible=vss == "visible", with_vsd=with_vsd)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from posecore.errors import ConfigError, PoseError, ShardError
-from posecore.interrupts import interrupts_ignored
+from posecore.processes import interrupts_ignored
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, load_meshes
 from torch import Tensor

@@ -1,9 +1,7 @@
 """Refinement of a BOP result file: estimates in, estimates out, image by image."""
 
 import itertools
-import time
-from collections.abc import Callable, Sequence
-from contextlib import closing, nullcontext
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -81,55 +79,97 @@ class Refined:
         return [one.estimate(found) for one in self.all for found in one.result.tried]
 
 
-def refine_estimates(
-    dataset: BopDataset,
-    starts: Sequence[Estimate],
-    method: PoseRefiner,
+@dataclass(frozen=True, kw_only=True, eq=False)
+class OfImage:
+    """The start poses in one image.
+
+    Attributes:
+        scene_id: Its scene.
+        im_id: Its number there.
+        places: Of the start poses among all.
+        requests: The poses to refine, in that order.
+    """
+
+    scene_id: int
+    im_id: int
+    places: tuple[int, ...]
+    requests: tuple[Request, ...]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Results:
+    """What came of the poses of one image, and how long all of them took, rendering included, reading excluded."""
+
+    found: tuple[Refinement, ...]
+    taken_s: float
+
+
+def by_image(starts: Sequence[Estimate]) -> list[OfImage]:
+    """Start poses image by image, in the order of scenes and images."""
+    order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
+    images = []
+    for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
+        places = tuple(group)
+        requests = tuple(Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in places)
+        images.append(OfImage(scene_id=scene_id, im_id=im_id, places=places, requests=requests))
+    return images
+
+
+def add_results(
     refined: Refined,
+    starts: Sequence[Estimate],
+    images: Sequence[OfImage],
+    results: Iterable[Results],
     *,
-    overlay: Path | None = None,
-    on_image: Callable[[int], None] | None = None,
+    on_image: Callable[[OfImage, Results], None],
 ) -> None:
-    """Refine every start pose in its image, adding to `refined` as it goes, so that an error loses nothing.
+    """Add what comes of image after image to `refined`, so that an error on the way loses nothing.
 
     An estimate's score is the method's confidence (the start's score where it has none), its time that of refining all
-    poses of its image, rendering included, reading excluded.
+    poses of its image.
 
     Args:
-        dataset: Images and cameras.
-        starts: Start poses.
-        method: With the meshes of all their objects.
         refined: Filled.
-        overlay: Folder for one picture an image, start contours red, refined ones green.
-        on_image: Called after each image with the number of poses in it.
-
-    Raises:
-        DatasetError: The method needs depth, and an image has none.
-        CameraError: An image's camera is that of an image of another size.
+        starts: Start poses.
+        images: These, image by image.
+        results: For each image.
+        on_image: Called after each.
     """
-    order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
-    drawing = closing(Overlay({i: dataset.mesh(i) for i in sorted({s.obj_id for s in starts})})) if overlay else None
-    with drawing or nullcontext() as painter:
-        for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
-            rows = list(group)
-            frame = load_frame(dataset, scene_id, im_id, method)
-            requests = [Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in rows]
-            begun = time.perf_counter()
-            found = method.refine_batch(frame, requests)
-            taken_s = time.perf_counter() - begun
-            for i, result in zip(rows, found, strict=True):
-                refined.done[i] = One(start=starts[i], result=result, taken_s=taken_s)
-            if painter is not None and overlay is not None:
-                picture = painter.draw(frame.image, frame.K, requests, START_RGB)
-                good = [
-                    Request(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
-                    for request, result in zip(requests, found, strict=True)
-                    if not result.failed
-                ]
-                picture = painter.draw(picture, frame.K, good, REFINED_RGB)
-                write_image(overlay / f"{scene_id:06d}_{im_id:06d}.png", picture)
-            if on_image is not None:
-                on_image(len(rows))
+    for image, result in zip(images, results, strict=True):
+        for place, one in zip(image.places, result.found, strict=True):
+            refined.done[place] = One(start=starts[place], result=one, taken_s=result.taken_s)
+        on_image(image, result)
+
+
+class OverlayFolder:
+    """Pictures of images with the start poses' contours in red, and those of refined ones in green.
+
+    Args:
+        dataset: With the images and meshes.
+        obj_ids: Objects that are drawn.
+        folder: For one picture an image.
+    """
+
+    def __init__(self, dataset: BopDataset, obj_ids: Collection[int], folder: Path) -> None:
+        self._dataset = dataset
+        self._folder = folder
+        self._overlay = Overlay({i: dataset.mesh(i) for i in sorted(obj_ids)})
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        self._overlay.close()
+
+    def write(self, image: OfImage, results: Results) -> None:
+        """Draw one image."""
+        K = self._dataset.camera(image.scene_id, image.im_id).K
+        rgb = self._dataset.rgb(image.scene_id, image.im_id)
+        good = [
+            Request(obj_id=request.obj_id, T_cam_obj=one.T_cam_obj)
+            for request, one in zip(image.requests, results.found, strict=True)
+            if not one.failed
+        ]
+        picture = self._overlay.draw(self._overlay.draw(rgb, K, image.requests, START_RGB), K, good, REFINED_RGB)
+        write_image(self._folder / f"{image.scene_id:06d}_{image.im_id:06d}.png", picture)
 
 
 def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:

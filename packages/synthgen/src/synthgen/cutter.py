@@ -4,9 +4,7 @@ Silhouettes, depth and contours are those of the mesh at the annotated pose; wha
 visible masks, or from the other annotated objects where there are none.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +17,7 @@ from posecore.bop import BopDataset
 from posecore.camera import crop_K
 from posecore.contour import contour_mask, distance_transform_px, sample_contour
 from posecore.errors import DatasetError, RenderError
+from posecore.processes import behave_as_worker, in_order, spawned
 from posecore.raster import Instance, Rasteriser
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import cut, cut_rgb
@@ -28,7 +27,6 @@ from synthgen.config import CutConfig
 from synthgen.draw.streams import Purpose, Subject, stream
 from synthgen.image.region import inside_image
 from synthgen.pair import limit_threads
-from synthgen.run.processes import behave_as_worker, spawned
 
 Array = np.ndarray
 _RIM = np.ones((3, 3), np.uint8)
@@ -147,20 +145,7 @@ def _mapped(
         return
     died = "a process that cuts died; start again, which goes on, with fewer --workers"
     with spawned(workers, _start_worker, (source,), died) as pool:
-        yield _few_ahead(pool, tasks, 2 * workers)
-
-
-def _few_ahead(
-    pool: ProcessPoolExecutor, tasks: Sequence[tuple[int, Sequence[Image]]], ahead: int
-) -> Iterator[shard.Encoded]:
-    """Results in order; no more are made than are soon written, for shards that wait take memory."""
-    waiting: deque[Future[shard.Encoded]] = deque()
-    for task in tasks:
-        waiting.append(pool.submit(_in_worker, task))
-        if len(waiting) >= ahead:
-            yield waiting.popleft().result()
-    while waiting:
-        yield waiting.popleft().result()
+        yield in_order(pool, _in_worker, tasks, 2 * workers)  # shards that wait to be written take memory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

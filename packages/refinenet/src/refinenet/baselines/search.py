@@ -89,9 +89,9 @@ class GradientSearch(Baseline):
         self._judged = network is not None and network.tells_closeness
         own = MIN_FIT if self._judged else MIN_AGREEMENT
         self._min_confidence = own if min_confidence is None else min_confidence
-        self._simple = {obj_id: simplified(mesh, MAX_FACES) for obj_id, mesh in meshes.items()}
-        self._quick = Rasteriser(self._simple)
+        self._quick = Rasteriser({})
         self._views: dict[int, SparseViews] = {}
+        """Of the objects that were asked for; these are in the quick rasteriser too."""
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -113,7 +113,9 @@ class GradientSearch(Baseline):
             return failed(T_cam_obj, 0, "the start pose shows nothing of the object in the image")
         obj_id = target.obj_id
         if obj_id not in self._views:
-            self._views[obj_id] = sparse_views(obj_id, self._simple[obj_id], self._quick)
+            simple = simplified(target.mesh, MAX_FACES)
+            self._quick.add(obj_id, simple)
+            self._views[obj_id] = sparse_views(obj_id, simple, self._quick)
         rng = np.random.default_rng([obj_id, zlib.crc32(start.tobytes())])
         quick = replace(target, rasteriser=self._quick)
         candidates = [start, *search(view, start, target.mesh, self._views[obj_id], rng)]

@@ -25,6 +25,10 @@ device_option = click.option(
 threads_option = click.option(
     "--threads", type=click.IntRange(0), default=0, help="Torch threads; 0 leaves torch's choice."
 )
+workers_option = click.option(
+    "--workers", type=click.IntRange(1), default=1,
+    help="Processes that refine images side by side, each with one torch thread where --threads does not say.",
+)  # fmt: skip
 iterations_option = click.option(
     "--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose; fewer once one is small."
 )

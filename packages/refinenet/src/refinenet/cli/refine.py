@@ -1,5 +1,6 @@
 """`refinenet refine`."""
 
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,9 @@ from refinenet.cli.options import (
     require_used,
     threads_option,
     verbose_option,
+    workers_option,
 )
-from refinenet.methods import NETWORK, WITH_CONFIDENCE, WITH_NETWORK, make_baseline
+from refinenet.methods import NETWORK, WITH_CONFIDENCE, WITH_NETWORK
 
 if TYPE_CHECKING:
     from refinenet.pool import PoolScorer
@@ -65,6 +67,7 @@ SHOWN_FAILURES = 5
 @device_option
 @click.option("--batch", type=click.IntRange(1), default=64, help="Most poses in one forward pass.")
 @threads_option
+@workers_option
 @other_mesh_option
 @quiet_option
 @verbose_option
@@ -88,6 +91,7 @@ def refine(
     device: str,
     batch: int,
     threads: int,
+    workers: int,
     allow_other_mesh: bool,
     quiet: bool,
     verbose: bool,
@@ -125,10 +129,8 @@ def refine(
     from posecore.files import require_writable
 
     from refinenet import checkpoint as checkpoints
-    from refinenet.estimates import Refined, make_sidecar, refine_estimates
-    from refinenet.methods import PoseRefiner
-    from refinenet.pool import PooledRefiner
-    from refinenet.refine import Refiner
+    from refinenet.estimates import OfImage, OverlayFolder, Refined, Results, add_results, by_image, make_sidecar
+    from refinenet.recipe import Recipe, refined_by_workers, refined_here
 
     if threads:
         torch.set_num_threads(threads)
@@ -143,26 +145,33 @@ def refine(
     start_sidecar = read_sidecar(init) or {}
     for path in filter(None, (out, candidates)):
         require_writable(path)
-    meshes = {i: bop.mesh(i) for i in sorted({s.obj_id for s in starts})}
-    network: Refiner | None = None
-    if loaded is not None:
-        network = Refiner(
-            loaded, meshes, iterations=iterations, device=device, batch=batch, allow_other_mesh=allow_other_mesh,
-            min_confidence=(min_confidence or 0.0) if method == NETWORK else 0.0,
-        )  # fmt: skip
-    if network is None or method != NETWORK:
-        refiner: PoseRefiner = make_baseline(method, meshes, iterations, network=network, min_confidence=min_confidence)
-    else:
-        refiner = network if hypotheses == 1 else PooledRefiner(network, hypotheses, scorer, seed)
-    result, stopped = Refined(keep_failed=keep_failed), None
+    obj_ids = tuple(sorted({s.obj_id for s in starts}))
+    recipe = Recipe(
+        dataset=dataset, split=bop.split, obj_ids=obj_ids, method=method, checkpoint=checkpoint, iterations=iterations,
+        device=device, batch=batch, allow_other_mesh=allow_other_mesh, min_confidence=min_confidence,
+        hypotheses=hypotheses, scorer=scorer, seed=seed, threads=threads,
+    )  # fmt: skip
+    refiner = recipe.make(bop, loaded)
+    result, stopped, images = Refined(keep_failed=keep_failed), None, by_image(starts)
     try:
-        with progress_bar(quiet) as bar:
+        with ExitStack() as stack:
+            stack.enter_context(closing(refiner))
+            painter = overlay and stack.enter_context(closing(OverlayFolder(bop, obj_ids, overlay)))
+            bar = stack.enter_context(progress_bar(quiet))
             task = bar.add_task("poses", total=len(starts))
-            refine_estimates(bop, starts, refiner, result, overlay=overlay, on_image=lambda n: bar.advance(task, n))
+
+            def after(image: OfImage, results: Results) -> None:
+                if painter:
+                    painter.write(image, results)
+                bar.advance(task, len(image.places))
+
+            if workers > 1:
+                results = stack.enter_context(refined_by_workers(recipe, images, workers))
+            else:
+                results = refined_here(bop, refiner, images)
+            add_results(result, starts, images, results, on_image=after)
     except (KeyboardInterrupt, PoseError, OSError) as error:
         stopped = error
-    finally:
-        refiner.close()
     if stopped is not None and not result.done:
         end_early(stopped, None)
     sidecar = make_sidecar(

@@ -26,16 +26,17 @@ from posecore.bop import (
 )
 from posecore.errors import ConfigError, DatasetError, RenderError
 from posecore.files import storage_error, write_atomic
-from posecore.interrupts import interrupts_ignored
 from posecore.mesh import Mesh
+from posecore.processes import behave_as_worker, interrupts_ignored
 
 from synthgen.assets import Assets
+from synthgen.blender.paths import forget_blenders_paths
 from synthgen.bop.framemaker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig
 from synthgen.dataset import versions
 from synthgen.draw.target import Target, make_targets
 from synthgen.pair import limit_threads
-from synthgen.run import lock, processes
+from synthgen.run import lock
 
 CARD = "synthgen.json"
 _FARTHEST_STEP = 65535
@@ -314,8 +315,8 @@ class _Worker:
 
 
 def _start(job: FrameJob) -> None:
-    processes.behave_as_worker()
-    processes.forget_blenders_paths()
+    behave_as_worker()
+    forget_blenders_paths()
     _Worker.job = job
 
 

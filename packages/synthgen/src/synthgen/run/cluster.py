@@ -9,7 +9,7 @@ import dask
 from distributed import Client, LocalCluster, Nanny
 from distributed.system import MEMORY_LIMIT
 from posecore.errors import RenderError
-from posecore.interrupts import interrupts_ignored
+from posecore.processes import interrupts_ignored
 
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
 SETTINGS = {

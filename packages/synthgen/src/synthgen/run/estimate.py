@@ -10,10 +10,10 @@ from pathlib import Path
 
 from posecore import shard
 from posecore.errors import PoseError, RenderError, StorageError
+from posecore.processes import die_with_parent
 
 from synthgen.machine import free_bytes, size_text
 from synthgen.pair import concatenate
-from synthgen.run.processes import die_with_parent
 from synthgen.run.shardrun import ShardJob, ShardRenderer, scenes_in
 
 _START_S = 300.0  # for Blender to start and the first scene to compile its kernels

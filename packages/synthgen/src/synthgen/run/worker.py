@@ -17,10 +17,11 @@ from distributed.worker import Worker
 from posecore import shard
 from posecore.errors import RenderError
 from posecore.files import sha256_bytes
+from posecore.processes import die_with_parent
 
 from synthgen import dataset
+from synthgen.blender.paths import forget_blenders_paths
 from synthgen.run import scratch
-from synthgen.run.processes import die_with_parent, forget_blenders_paths
 from synthgen.run.shardrun import SceneError, ShardJob, ShardRenderer
 
 GROWTH_LIMIT_BYTES = 1 << 30

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from posecore.errors import ShardError, StorageError
+from posecore.processes import behave_as_worker, spawned
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, n_shards
 from posecore.shard.group import metadata
 
 from synthgen.pair import limit_threads
-from synthgen.run.processes import behave_as_worker, spawned
 from synthgen.verify.checks import CHECKS, Check
 from synthgen.verify.coverage import Coverage, coverage_of, joined
 from synthgen.verify.facts import Batch, Facts, load_facts, manifest_lines
