@@ -69,7 +69,7 @@ SIZES = {
         judge="--steps 4 --batch 8 --set validation.pairs=16",
         render="--engine raster --workers 2",
         frame="--engine raster --workers 1",
-        refine="--workers 2",
+        refine="--workers 2 --threads 1",
         tested="--object 1",
         smaller="--set shard_size=8",
     ),
@@ -80,7 +80,7 @@ SIZES = {
         judge="--steps 3600 --set optimiser.lr=0.0005",
         render="--engine cycles --samples 6 --workers 2",
         frame="--engine cycles --samples 12 --workers 2",
-        refine="--workers 2",
+        refine="--workers 2 --threads 1",
     ),
     "full": Size(
         pairs=100_000,
@@ -89,7 +89,7 @@ SIZES = {
         judge="--steps 50000 --set optimiser.lr=0.0005",
         render=f"--engine cycles --samples 6 {ON_GPUS}",
         frame="--engine cycles --samples 12 --workers 8",
-        refine="--workers 8",
+        refine="--workers 8 --threads 1",
     ),
 }
 
@@ -141,7 +141,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             f"--init {folder}/run_learn/best.safetensors {LOADER} {MISTAKES} {chosen.judge}",
         ),
     ]  # fmt: skip
-    refine = f"refinenet refine --dataset {data} --init {init} --keep-failed --threads 1 {chosen.refine} {chosen.tested}"
+    refine = f"refinenet refine --dataset {data} --init {init} --keep-failed {chosen.refine} {chosen.tested}"
     # the judge's best is not the checkpoint whose poses are best from hypotheses that are drawn
     networks = {"learn": "run_learn/best.safetensors", "judge": "run_judge/last.safetensors"}
     methods = {"search": "", **{name: f"--checkpoint {folder}/{file}" for name, file in networks.items()}}
@@ -216,7 +216,7 @@ def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> It
         why="What `search` weighs from there.",
         command=words(
             f"refinenet refine --method search --checkpoint {folder}/run_learn/best.safetensors --dataset {frames} "
-            f"--init {start}.csv --keep-failed --threads 1 {size.refine} --out {folder}/found{seed}.csv "
+            f"--init {start}.csv --keep-failed {size.refine} --out {folder}/found{seed}.csv "
             f"--candidates {folder}/weighed{seed}.csv"
         ),
         leaves=f"weighed{seed}.csv",
