@@ -41,3 +41,15 @@ def test_both_engines_show_the_formula(name):
     assert np.quantile(difference, 0.9) < 0.12  # a pixel of the picture is an average, the formula a point
     assert difference.mean() < 0.05
     assert len(v) > 1000
+
+
+def test_a_patterned_thing_that_is_hidden_wholly_changes_nothing():
+    engine = make_engine("raster", threads=1)
+    engine.load({1: quad()})
+    front = SceneObject(mesh_key=1, T_cam_obj=at(0.0, 0.0, 0.5), material=Material(base_rgb=(0.2, 0.5, 0.1)))
+    behind = SceneObject(mesh_key=1, T_cam_obj=at(0.0, 0.0, 0.6), material=LOOK)
+    alone, both = (engine.render(scene_of(*things, samples=4)) for things in ((front,), (front, behind)))
+    engine.close()
+    assert (alone.index == 0).any()
+    np.testing.assert_array_equal(both.index, alone.index)
+    np.testing.assert_array_equal(both.rgb_linear, alone.rgb_linear)

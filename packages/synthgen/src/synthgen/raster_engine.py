@@ -116,12 +116,13 @@ def _recolour(layers: SceneLayers, scene: Scene, K: Float[Array, "3 3"]) -> UInt
     assert rgb is not None
     for i, placed in enumerate(scene.objects):
         material = placed.material
+        inside = layers.instance == i
+        if not inside.any():  # hidden by others, or out of sight
+            continue
         if material.base_rgb is None and _changes_colour(material):
-            inside = layers.instance == i
-            if inside.any():
-                rgb[inside] = _shift(rgb[inside], material)
+            rgb[inside] = _shift(rgb[inside], material)
         elif material.pattern is not None:
-            v, u = np.nonzero(layers.instance == i)
+            v, u = np.nonzero(inside)
             p_cam = back_project(K, np.stack([u, v], -1) + 0.5, layers.depth_m[v, u])
             rgb[v, u] = pattern.paint(rgb[v, u], material, apply(inverse(placed.T_cam_obj), p_cam))
     return rgb
