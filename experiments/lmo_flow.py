@@ -5,7 +5,7 @@ real ones (`stand_ins.py`): it is as good as its judge, and those are what a jud
 real frames are for testing only; their start poses are the result file `init*.csv` in --data.
 
   --smoke  a few steps on a few pairs, one object: a test of the plumbing
-  --small  9 600 path-traced pairs, 300 frames
+  --small  9 600 path-traced pairs, 210 frames
   --full   100 000 pairs, 3 000 frames; a GPU
 
     python experiments/lmo_flow.py --small --data lmo --backgrounds backgrounds --hdris hdri
@@ -26,9 +26,11 @@ SETS = (17, 18, 19)
 """Seeds of the sets of frames, each of other altered meshes."""
 PATCHES = "--set patch_px=160"
 FRAMES = (
-    "--objects-per-frame 5 8 --preset tabletop --set distance.min=5 --set background.photo_share=0.85 "
-    "--set tabletop.near_share=0.5 --set tabletop.hover_diameter=[0,0.05]"
+    "--objects-per-frame 6 8 --preset tabletop --set distance.min=5 --set background.photo_share=0.85 "
+    "--set tabletop.near_share=0.5 --set tabletop.hover_diameter=[0,0.05] --set tabletop.gap_diameter=[0,0.05] "
+    "--set tabletop.size_diameter=[6,10] --set tabletop.distractors=[2,5] --set tabletop.elevation_deg=[12,50]"
 )
+"""Crowded, so that half of the objects are hidden in part."""
 STARTS = "--random-up-to 65 --random-translation 0.3 --depth-stretch 6"
 LOADER = "--threads 1 --set loader.cache_mb=6000 --set validation.scene_share=0.04"
 MISTAKES = "--set hypothesis.stored_share=0.5 --set loss.min_closeness=0.02 --set loader.shuffle_shards=32"
@@ -75,7 +77,7 @@ SIZES = {
     ),
     "small": Size(
         pairs=9600,
-        frames=100,
+        frames=70,
         learn="--steps 4200 --set loader.shuffle_shards=8",
         judge="--steps 3600 --set optimiser.lr=0.0005",
         render="--engine cycles --samples 6 --workers 2",

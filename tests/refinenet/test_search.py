@@ -256,12 +256,73 @@ def test_the_result_depends_on_image_and_start_alone(tug, seen):
     assert alone.iterations >= len(ROUNDS)
 
 
+@pytest.fixture(scope="module")
+def covered(tug, mesh):
+    """Frames in which another object hides a third to two thirds of the tug: that object's mesh, and for each frame the
+    image, both poses, and the camera z of the other."""
+    frames = []
+    with Rasteriser({1: tug, 2: mesh}) as rasteriser:
+        for seed, aside in ((1, -0.25), (3, 0.25)):
+            frame, truth = rendered_frame(tug, rasteriser, seed)
+            centre_m = truth[:3, :3] @ tug.center_m + truth[:3, 3]
+            R = se3.random_rotation(np.random.default_rng(seed))
+            front = se3.make_T(R, 0.8 * centre_m + np.array([aside * tug.diameter_m, 0.0, 0.0]))
+            layers = rasteriser.render(2, K, front[None], frame.image.shape[1], frame.image.shape[0])
+            soft = cv2.GaussianBlur(layers.mask[0].astype(np.float32), (0, 0), 0.7)[..., None]
+            image = (layers.rgb[0] * soft + frame.image * (1 - soft)).astype(np.uint8)
+            frames.append((replace(frame, image=image), truth, front, layers.depth_m[0]))
+    return mesh, frames
+
+
+def test_what_is_known_to_be_in_front_does_not_count(tug, covered):
+    _, frames = covered
+    with Rasteriser({1: tug}) as rasteriser:
+        target = Target(obj_id=1, mesh=tug, rasteriser=rasteriser)
+        views = sparse_views(1, tug, rasteriser)
+        for frame, truth, _, known_m in frames:
+            known = replace(target, known_m=known_m)
+            assert agreement_of(frame, truth, known) > 1.4 * agreement_of(frame, truth, target)
+            plain, aware = (look(frame.image, frame.K, truth, one, 96) for one in (target, known))
+            assert plain.seeable.all()
+            hidden = plain.mask & ~aware.seeable
+            assert 0.2 < hidden.sum() / plain.mask.sum() < 0.7
+            responses = response_maps(plain, 1)
+            alone, behind = (
+                views.agreement(truth[None], view.K, view.seen_until_m, responses)[0] for view in (plain, aware)
+            )
+            assert behind > 1.2 * alone
+            behind_all = replace(
+                target, known_m=np.where(known_m > 0, 2 * truth[2, 3], 0.0)
+            )  # what lies behind it hides nothing
+            assert look(frame.image, frame.K, truth, behind_all, 96).seeable.all()
+            wall = replace(target, known_m=np.full_like(known_m, 0.1))
+            assert look(frame.image, frame.K, truth, wall, 96) is None
+
+
+def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
+    thing, frames = covered
+    for frame, truth, front, _ in frames:
+        start = Request(obj_id=1, T_cam_obj=far_start(truth, 1))
+        rng = np.random.default_rng(0)
+        near = Request(obj_id=2, T_cam_obj=se3.perturb(front, np.deg2rad(6), 0.05 * thing.diameter_m, rng))
+        refiner = make_baseline("search", {1: tug, 2: thing}, 2)
+        (alone,) = refiner.refine_batch(frame, [start])
+        behind, before = refiner.refine_batch(frame, [start, near])
+        refiner.close()
+        assert alone.failed
+        assert not before.failed
+        assert distances(tug, truth, behind.T_cam_obj) < 0.02
+        assert behind.confidence > 0.5
+        assert behind.iterations > alone.iterations
+        assert len(behind.tried) > len(alone.tried)
+
+
 def test_the_truth_agrees_best(tug, seen):
     _, truth, view, views = seen
     rng = np.random.default_rng(0)
     near = [se3.perturb(truth, np.deg2rad(12), 0.08 * tug.diameter_m, rng) for _ in range(30)]
     sharp, spread = (
-        views.agreement(np.stack([truth, *near]), view.K, view.in_image, response_maps(view, px)) for px in (1, 4)
+        views.agreement(np.stack([truth, *near]), view.K, view.seen_until_m, response_maps(view, px)) for px in (1, 4)
     )
     assert sharp[0] > 0.8
     assert sharp[0] > sharp[1:].max()
@@ -274,14 +335,14 @@ def test_edges_from_any_viewpoint_lie_where_a_render_has_them(tug, seen):
     """Response maps of the render itself, one pixel wide: nearly every edge of the nearest viewpoint finds its own."""
     _, _, around, views = seen
     K = np.array([[300.0, 0, 32], [0, 280.0, 32], [0, 0, 1]])  # pixels that are not square
-    everywhere = np.ones((64, 64), bool)
+    everywhere = np.full((64, 64), np.inf)
     agreement = []
     with Rasteriser({1: tug}) as rasteriser:
         for seed in range(8):
             R = se3.random_rotation(np.random.default_rng(seed))
             T = se3.make_T(R, np.array([0.01, -0.01, 5.0 * tug.diameter_m]) - R @ tug.center_m)
             rgb = rasteriser.render(1, K, T[None], 64, 64).rgb[0]
-            view = replace(around, scene_rgb=rgb, in_image=everywhere)
+            view = replace(around, scene_rgb=rgb, seen_until_m=everywhere)
             agreement.append(views.agreement(T[None], K, everywhere, response_maps(view, 1))[0])
     assert min(agreement) > 0.8
     assert np.median(agreement) > 0.9
@@ -292,14 +353,14 @@ def test_what_lies_outside_of_the_patch_counts_against_a_pose_and_of_the_image_o
     ones = np.ones((16, 64, 64), np.float32)
     aside = truth.copy()
     aside[0, 3] += 10.0
-    half = np.zeros((64, 64), bool)
-    half[:, 32:] = True
-    everywhere = np.ones((64, 64), bool)
+    half = np.zeros((64, 64))
+    half[:, 32:] = np.inf
+    everywhere = np.full((64, 64), np.inf)
     inside, outside = views.agreement(np.stack([truth, aside]), view.K, everywhere, ones)
     assert inside == pytest.approx(1)
     assert outside == 0
     assert views.agreement(truth[None], view.K, half, ones)[0] > 0.9
-    assert views.agreement(truth[None], view.K, half[:, ::-1] & half, ones)[0] == 0
+    assert views.agreement(truth[None], view.K, np.minimum(half[:, ::-1], half), ones)[0] == 0
 
 
 def test_a_sheet_seen_from_its_side_has_points_near_itself(tug):
@@ -354,7 +415,7 @@ def test_edges_count_without_their_sign_and_not_across(seen):
     view = seen[2]
     bars = np.zeros((64, 64, 3), np.uint8)
     bars[:, 20:40] = 200
-    upright = response_maps(type(view)(**{**vars(view), "scene_rgb": bars, "in_image": np.ones((64, 64), bool)}), 0)
+    upright = response_maps(replace(view, scene_rgb=bars, seen_until_m=np.full((64, 64), np.inf)), 0)
     across, along = upright[0], upright[len(upright) // 2]  # bins of doubled angle: gradients along x, and along y
     assert across[32, 20] == across[32, 40] == pytest.approx(1)
     assert along.max() == 0

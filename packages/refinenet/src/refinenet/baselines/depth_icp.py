@@ -86,7 +86,7 @@ def _scene_depth_m(view: View, depth_m: Float[Array, "h w"]) -> Float[Array, "p 
     centre = (np.arange(len(view.depth_m)) + 0.5) * view.window.side_px / len(view.depth_m)
     rows = np.floor(view.window.y0_px + centre).astype(int).clip(0, depth_m.shape[0] - 1)
     columns = np.floor(view.window.x0_px + centre).astype(int).clip(0, depth_m.shape[1] - 1)
-    return np.where(view.in_image, depth_m[rows[:, None], columns], 0.0)
+    return np.where(view.seeable, depth_m[rows[:, None], columns], 0.0)
 
 
 def _on_the_surface(
@@ -123,7 +123,7 @@ def _run(
     view = _look(frame, pose, target)
     if view is None:
         return None
-    seen = view.mask & view.in_image
+    seen = view.mask & view.seeable
     confirmed = np.abs(_scene_depth_m(view, depth_m) - view.depth_m)[seen] < SUPPORT * diameter_m
     return Attempt(pose=pose, before=before, iterations=done, support=float(confirmed.mean()))
 

@@ -128,8 +128,8 @@ def match(view: View, reach_px: float) -> Matches:
     # The colour beside the silhouette is the background's, which nobody knows; inside, both sides are the object's.
     n = len(outline.uv_px)
     aligned[n:] &= np.einsum("nsc,nc->ns", across[n:], colour_step) > MIN_AGREEMENT * strength[n:]
-    pixel = np.floor(uv_px).astype(int).clip(0, len(view.in_image) - 1)
-    strength = np.where(aligned & view.in_image[pixel[..., 1], pixel[..., 0]], strength, 0.0)
+    pixel = np.floor(uv_px).astype(int).clip(0, len(view.seeable) - 1)
+    strength = np.where(aligned & view.seeable[pixel[..., 1], pixel[..., 0]], strength, 0.0)
 
     behind, middle, ahead = strength[:, :-2], strength[:, 1:-1], strength[:, 2:]
     peak = (middle >= behind) & (middle > ahead) & (middle > MIN_GRADIENT)

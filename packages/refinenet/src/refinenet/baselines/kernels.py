@@ -8,7 +8,7 @@ from posecore.compiled import compiled
 
 @compiled
 @no_type_check
-def mean_response(T_cam_obj, K, nearest, points_m, normals, in_image, responses):
+def mean_response(T_cam_obj, K, nearest, points_m, normals, seen_until_m, responses):
     """Behind `SparseViews.agreement`; `nearest` are viewpoints."""
     result = np.zeros(len(T_cam_obj))
     bins, side = responses.shape[0], responses.shape[1]
@@ -25,7 +25,7 @@ def mean_response(T_cam_obj, K, nearest, points_m, normals, in_image, responses)
             row = np.floor(K[1, 1] * y_cam / z_cam + K[1, 2])
             if not (0 <= column < side and 0 <= row < side):
                 count += 1
-            elif in_image[int(row), int(column)]:
+            elif z_cam < seen_until_m[int(row), int(column)]:
                 count += 1
                 x, y, z = normals[v, k, 0], normals[v, k, 1], normals[v, k, 2]
                 dx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z

@@ -45,8 +45,10 @@ class Baseline(ABC):
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses in one image."""
-        targets = [Target(obj_id=r.obj_id, mesh=self._meshes[r.obj_id], rasteriser=self._rasteriser) for r in requests]
-        return [self._refine(frame, r.T_cam_obj, target) for r, target in zip(requests, targets, strict=True)]
+        return [self._refine(frame, request.T_cam_obj, self._target(request)) for request in requests]
+
+    def _target(self, request: Request) -> Target:
+        return Target(obj_id=request.obj_id, mesh=self._meshes[request.obj_id], rasteriser=self._rasteriser)
 
     def close(self) -> None:
         """Free what the renderer holds."""

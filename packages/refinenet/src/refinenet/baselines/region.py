@@ -69,7 +69,7 @@ def colours_of(view: View, margin_px: float) -> Colours | None:
     margin has the other's colours, and colours that are to be seen nowhere else would hold it where it is.
     """
     phi = signed_distance_px(view.mask)[0]
-    inside, outside = view.mask & view.in_image, (phi < -margin_px) & view.in_image
+    inside, outside = view.mask & view.seeable, (phi < -margin_px) & view.seeable
     inside &= phi > min(margin_px, 0.5 * float(phi.max()))
     if inside.sum() < MIN_PIXELS or outside.sum() < MIN_PIXELS:
         return None
@@ -120,7 +120,7 @@ def refine_by_regions(
             view = look(probable, K, pose, target, patch_px)
             if view is None:
                 return failed(T_cam_obj, done, "the object is not in the image")
-            if (contour_mask(view.mask) & view.in_image).sum() < MIN_CONTOUR:
+            if (contour_mask(view.mask) & view.seeable).sum() < MIN_CONTOUR:
                 return failed(T_cam_obj, done, f"the silhouette has under {MIN_CONTOUR} pixels of contour in the image")
             before, pose = pose, moved(pose, _update(view, pose, length_m), length_m)
             done += 1
@@ -128,7 +128,7 @@ def refine_by_regions(
     if view is None:
         return failed(T_cam_obj, done, "the object left the image")
     at = view.scene_rgb[..., 0] / 255
-    separation = at[view.mask & view.in_image].mean() - at[~view.mask & view.in_image].mean()
+    separation = at[view.mask & view.seeable].mean() - at[~view.mask & view.seeable].mean()
     if separation < MIN_SEPARATION:
         return failed(T_cam_obj, done, "object and background have the same colours")
     return refined(T_cam_obj, before, pose, done, target.mesh.diameter_m)
@@ -154,7 +154,7 @@ def _update(view: View, pose: Float[Array, "4 4"], length_m: float) -> Float[Arr
     The view's image holds posteriors, see `_as_image`.
     """
     phi, nearest = signed_distance_px(view.mask)
-    row, column = np.nonzero((np.abs(phi) < BAND_PX) & view.in_image)
+    row, column = np.nonzero((np.abs(phi) < BAND_PX) & view.seeable)
     probable = view.scene_rgb[row, column, 0] / 255
     at = phi[row, column]
     # Logistic, not the arc tangent of the paper, whose long tails let far pixels push the size.

@@ -6,6 +6,9 @@ them, ever closer, while an edge of the image counts from less and less far away
 LINE-2D (Hinterstoisser et al., PAMI 2012), in response maps made once for all poses; the draws are an evolution
 strategy. What agrees best is often not the truth, but the truth is mostly among the poses that agree well: edge ICP
 starts from several, a network follows where one is given, and renders decide, with the network where it was trained to.
+
+What hides an object has edges of its own, which count against the truth and for other poses. Often it is an object that
+is looked for as well: what was found is known for those that were not, and they are searched for once more.
 """
 
 import zlib
@@ -18,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from posecore import se3
 from posecore.mesh import Mesh
-from posecore.raster import Rasteriser
+from posecore.raster import Instance, Rasteriser
 from posecore.simplify import simplified
 
 from refinenet.agreement import SCENE_EDGE, gradient_agreement, gradients
@@ -61,7 +64,7 @@ gradients, or its mean with the closeness that a network tells."""
 
 
 class GradientSearch(Baseline):
-    """`--method search`. Draws depend on the start pose alone.
+    """`--method search`. Draws depend on the start pose alone; what was found in the same image may help.
 
     Args:
         meshes: Objects by id.
@@ -105,6 +108,32 @@ class GradientSearch(Baseline):
             self._network.close()
         self._quick.close()
         super().close()
+
+    def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+        """Refine poses in one image: each for itself, then those that failed, behind what was found."""
+        results = super().refine_batch(frame, requests)
+        known = 0
+        while known < (found := sum(not result.failed for result in results)) < len(results):
+            known, known_m = found, self._known_m(frame, requests, results)
+            for i, (request, first) in enumerate(zip(requests, results, strict=True)):
+                if first.failed:
+                    again = self._refine(frame, request.T_cam_obj, replace(self._target(request), known_m=known_m))
+                    results[i] = replace(
+                        first if again.failed else again,
+                        iterations=first.iterations + again.iterations,
+                        tried=(*first.tried, *again.tried),
+                    )
+        return results
+
+    def _known_m(self, frame: Frame, requests: Sequence[Request], results: Sequence[Refinement]) -> Float[Array, "h w"]:
+        """Camera z of what was found, 0 elsewhere."""
+        found = [
+            Instance(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
+            for request, result in zip(requests, results, strict=True)
+            if not result.failed
+        ]
+        height_px, width_px = frame.image.shape[:2]
+        return self._quick.render_scene(found, frame.K, width_px, height_px, rgb=False).depth_m
 
     def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
         start = np.ascontiguousarray(T_cam_obj, np.float64)
@@ -166,7 +195,7 @@ def agreement_of(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -
     view = look(frame.image, frame.K, T_cam_obj, target, JUDGE_PX)
     if view is None:
         return 0.0
-    return float(gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.in_image[None])[0])
+    return float(gradient_agreement(view.scene_rgb[None], view.rgb[None], view.mask[None], view.seeable[None])[0])
 
 
 def search(
@@ -185,7 +214,7 @@ def search(
 
     def best_of(moves: Float[Array, "n 6"], kept: int, spread_px: int) -> tuple[Array, Array]:
         T = moved_by(start, moves, mesh)
-        agreement = views.agreement(T, view.K, view.in_image, responses[spread_px])
+        agreement = views.agreement(T, view.K, view.seen_until_m, responses[spread_px])
         order = np.argsort(-agreement, kind="stable")[:kept]
         return moves[order], agreement[order]
 
@@ -249,8 +278,9 @@ def response_maps(view: View, spread_px: int) -> Float[Array, "o p p"]:
     """For each orientation of an edge, how well the image's edges within `spread_px` agree with it, in [0, 1]."""
     unit, strength = gradients(view.scene_rgb[None].astype(np.float32))
     x, y = unit[0, ..., 0], unit[0, ..., 1]
+    edges = (strength[0] > SCENE_EDGE) & (view.seen_until_m > 0)
     # of doubled angle: opposite gradients have the same
-    doubled = np.stack([x * x - y * y, 2 * x * y], axis=-1) * ((strength[0] > SCENE_EDGE) & view.in_image)[..., None]
+    doubled = np.stack([x * x - y * y, 2 * x * y], axis=-1) * edges[..., None]
     angle_rad = 2 * np.pi * np.arange(ORIENTATIONS) / ORIENTATIONS
     maps = np.tensordot(np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=1), doubled, axes=(1, 2))
     maps = np.maximum(maps, 0).astype(np.float32)

@@ -50,24 +50,26 @@ class SparseViews:
         self,
         T_cam_obj: Float[Array, "b 4 4"],
         K: Float[Array, "3 3"],
-        in_image: Bool[Array, "p p"],
+        seen_until_m: Float[Array, "p p"],
         responses: Float[Array, "o p p"],
     ) -> Float[Array, " b"]:
         """Mean response at the edges of poses, all in front of the camera.
 
-        Points outside of the patch count 0. Those outside of the image do not count, up to half of all.
+        Points outside of the patch count 0. Those outside of the image, or behind what is known to be there, do not
+        count, up to half of all.
 
         Args:
             T_cam_obj: Poses, metres.
             K: Camera of the patch.
-            in_image: Patch pixels that lie in the image.
+            seen_until_m: Camera z up to which a patch pixel shows what is there: 0 outside of the image, else infinite
+                where nothing is known to be.
             responses: For orientations evenly over half a turn, how well the image's edges agree.
         """
         R, centre_m = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, :3] @ self.center_m + T_cam_obj[:, :3, 3]
         towards = -np.einsum("bji,bj->bi", R, centre_m) / np.linalg.norm(centre_m, axis=1, keepdims=True)
         nearest = self.viewpoints.query(towards)[1]
         T = np.ascontiguousarray(T_cam_obj, np.float64)
-        return np.asarray(mean_response(T, K, nearest, self.points_m, self.normals, in_image, responses))
+        return np.asarray(mean_response(T, K, nearest, self.points_m, self.normals, seen_until_m, responses))
 
 
 def sparse_views(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> SparseViews:

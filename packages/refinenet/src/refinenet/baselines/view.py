@@ -28,11 +28,13 @@ class Target:
         obj_id: The mesh's id in the rasteriser.
         mesh: For its size.
         rasteriser: Has the mesh.
+        known_m: Camera z of what is known to be seen in the image, 0 elsewhere; None where nothing is known.
     """
 
     obj_id: int
     mesh: Mesh
     rasteriser: Rasteriser
+    known_m: Float[Array, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,7 +47,9 @@ class View:
         depth_m: Camera z of the object's render, 0 beside it.
         rgb: Colours of the object's render on black.
         scene_rgb: The image.
-        in_image: Patch pixels whose centre lies in the image; elsewhere `scene_rgb` repeats the image's border.
+        seen_until_m: Camera z up to which a patch pixel shows what is there: 0 outside of the image, where `scene_rgb`
+            repeats the border, and infinite where nothing is known to be.
+        seeable: Patch pixels that lie in the image and show nothing known that is nearer than the object.
     """
 
     K: Float[Array, "3 3"]
@@ -53,7 +57,8 @@ class View:
     depth_m: Float[Array, "p p"]
     rgb: UInt8[Array, "p p 3"]
     scene_rgb: UInt8[Array, "p p 3"]
-    in_image: Bool[Array, "p p"]
+    seen_until_m: Float[Array, "p p"]
+    seeable: Bool[Array, "p p"]
 
     @property
     def mask(self) -> Bool[Array, "p p"]:
@@ -96,7 +101,7 @@ def look(
     patch_px: int,
     scale: float = WINDOW_SCALE,
 ) -> View | None:
-    """The patch around a pose, `scale` projected diameters wide; None where no pixel of the object is in the image."""
+    """The patch around a pose, `scale` projected diameters wide; None where no pixel of the object can be seen."""
     if not finest_px(K, T_cam_obj, target.mesh, patch_px):
         return None
     window = diameter_window(K, T_cam_obj, target.mesh.center_m, target.mesh.diameter_m, scale)
@@ -108,16 +113,24 @@ def look(
     if not in_image.any():
         return None
     layers = target.rasteriser.render(target.obj_id, K_patch, T_cam_obj[None], patch_px, patch_px)
-    if not (layers.mask[0] & in_image).any():
-        return None
     assert layers.rgb is not None
+    mask, depth_m, seen_until_m = layers.mask[0], layers.depth_m[0], np.where(in_image, np.inf, 0.0)
+    if target.known_m is not None:
+        rows, columns = (np.floor(x).astype(int) for x in (v_px, u_px))
+        known_m = target.known_m[rows.clip(0, height_px - 1)[:, None], columns.clip(0, width_px - 1)]
+        seen_until_m = np.where(in_image & (known_m > 0), known_m, seen_until_m)
+    centre_m = T_cam_obj[2, :3] @ target.mesh.center_m + T_cam_obj[2, 3]
+    seeable = seen_until_m > np.where(mask, depth_m, centre_m)
+    if not (mask & seeable).any():
+        return None
     return View(
         K=K_patch,
         window=window,
-        depth_m=layers.depth_m[0],
+        depth_m=depth_m,
         rgb=layers.rgb[0],
         scene_rgb=_cut(image, window, patch_px),
-        in_image=in_image,
+        seen_until_m=seen_until_m,
+        seeable=seeable,
     )
 
 
@@ -135,13 +148,13 @@ def _cut(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[A
 
 
 def silhouette_edges(view: View, n: int) -> Edges:
-    """At most `n` points evenly along the silhouette inside the image, normals outwards.
+    """At most `n` points evenly along the silhouette where it can be seen, normals outwards.
 
     Contour pixels lie on the object, the edge half a pixel or less outside of their centres: the blurred silhouette
     says how far, as it falls off by the normal distribution across a straight edge.
     """
     pixels = trace(view.mask)
-    pixels = pixels[view.in_image[pixels[:, 0], pixels[:, 1]]]
+    pixels = pixels[view.seeable[pixels[:, 0], pixels[:, 1]]]
     pixels = pixels[_even(len(pixels), n)]
     row, column = pixels[:, 0], pixels[:, 1]
     soft = cv2.GaussianBlur(view.mask.astype(np.float32), (0, 0), EDGE_BLUR_PX)
@@ -187,7 +200,7 @@ def inner_edges(view: View, n: int, min_gradient: float) -> tuple[Edges, Float[A
     Returns:
         The edges, normals up the gradient, and (n, 3) each channel's share of the change across, of unit length.
     """
-    inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool) & view.in_image
+    inside = cv2.erode(view.mask.astype(np.uint8), np.ones((5, 5), np.uint8)).astype(bool) & view.seeable
     smooth = cv2.GaussianBlur(view.rgb.astype(np.float32), (0, 0), EDGE_BLUR_PX)
     dx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
     dy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
