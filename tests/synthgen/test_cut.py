@@ -257,6 +257,17 @@ def test_images_of_one_of_several_scenes_are_one_scene(images, own, tmp_path):
     assert not np.allclose(first, second)  # the same image, and other draws
 
 
+@pytest.mark.parametrize(
+    ("together", "one", "two"),
+    [(0, [0, 1, 2], [0, 0, 0, 1, 1, 1]), (2, [0, 0, 1], [0, 0, 1, 2, 2, 3]), (9, [0] * 3, [0] * 3 + [1] * 3)],
+)
+def test_images_of_a_video_go_together(images, own, together, one, two):
+    config = CutConfig(**SMALL, images_per_scene=together)
+    assert [image.scene_index for image in annotated.plan(images, config).images] == one
+    shutil.copytree(own.split_path / "000001", own.split_path / "000007")
+    assert [image.scene_index for image in annotated.plan(BopDataset(own.root), config).images] == two
+
+
 def test_hidden_rims_are_hidden_and_thin_differences_are_not():
     disc = cv2.circle(np.zeros((80, 80), np.uint8), (40, 40), 25, 1, -1) > 0
     lower = np.arange(80)[:, None] > 40

@@ -60,7 +60,7 @@ class Image:
     Attributes:
         scene_id, im_id: In the source.
         number: Position among the source's images: the address of its draws.
-        scene_index: Its scene in the dataset: all images of a BOP scene, where there are several, else it alone.
+        scene_index: Its scene in the dataset, see `CutConfig.images_per_scene`.
         camera: Its camera.
         annotated: All that is annotated in it with a pose in front of the camera.
         pairs: What is cut.
@@ -217,7 +217,7 @@ def plan(dataset: BopDataset, config: CutConfig, hypotheses: str | Path | None =
         ResultFileError: The result file is broken, or of other images.
     """
     given = None if hypotheses is None else _hypotheses_by_image(dataset, hypotheses)
-    images = _images(dataset, None if given is None else set(given), config.images)
+    images = _images(dataset, None if given is None else set(given), config)
     _require_one_size(dataset, images, one_focal_length=config.window == "fixed")
     meshes = {i: dataset.mesh(i) for i in sorted({gt.obj_id for image in images for gt in image.annotated})}
     picker = _Picker(config, meshes, images)
@@ -241,13 +241,13 @@ def plan(dataset: BopDataset, config: CutConfig, hypotheses: str | Path | None =
     )
 
 
-def _images(dataset: BopDataset, wanted: set[tuple[int, int]] | None, most: int) -> list[Image]:
-    """Images that may have a pair, evenly spread where there are more than `most`; 0 takes all."""
+def _images(dataset: BopDataset, wanted: set[tuple[int, int]] | None, config: CutConfig) -> list[Image]:
+    """Images that may have a pair, evenly spread where there are more than `config.images`; 0 takes all."""
     listed = [(scene_id, im_id) for scene_id in dataset.scene_ids for im_id in dataset.im_ids(scene_id)]
     numbered = [(number, *one) for number, one in enumerate(listed) if wanted is None or one in wanted]
-    if most and len(numbered) > most:
-        numbered = [numbered[i] for i in np.linspace(0, len(numbered) - 1, most).round().astype(int)]
-    scenes = {scene_id: place for place, scene_id in enumerate(dataset.scene_ids)}
+    if config.images and len(numbered) > config.images:
+        numbered = [numbered[i] for i in np.linspace(0, len(numbered) - 1, config.images).round().astype(int)]
+    scenes = _scene_indices(dataset, config.images_per_scene)
     images = []
     for number, scene_id, im_id in numbered:
         all_ = [gt for gt in dataset.gt(scene_id, im_id) if gt.has_pose]
@@ -258,12 +258,24 @@ def _images(dataset: BopDataset, wanted: set[tuple[int, int]] | None, most: int)
                 scene_id=scene_id,
                 im_id=im_id,
                 number=number,
-                scene_index=scenes[scene_id] if len(scenes) > 1 else number,
+                scene_index=scenes[scene_id, im_id],
                 camera=dataset.camera(scene_id, im_id),
                 annotated=[gt for gt in annotated if centre_m(gt.T_cam_obj, meshes[gt.obj_id])[2] > 0],
             )
         )
     return images
+
+
+def _scene_indices(dataset: BopDataset, images_per_scene: int) -> dict[tuple[int, int], int]:
+    """Number of the scene that each image counts to, see `CutConfig.images_per_scene`."""
+    own = images_per_scene or (1 if len(dataset.scene_ids) == 1 else None)
+    parts: dict[tuple[int, int], int] = {}
+    indices = {}
+    for scene_id in dataset.scene_ids:
+        for place, im_id in enumerate(dataset.im_ids(scene_id)):
+            part = (scene_id, 0 if own is None else place // own)
+            indices[scene_id, im_id] = parts.setdefault(part, len(parts))
+    return indices
 
 
 def _described(dataset: BopDataset, image: Image, pairs: Sequence[Pair]) -> bytes:

@@ -20,6 +20,8 @@ class CutConfig:
         min_visible: Annotated poses that are visible by less are left out, and those whose box the image shows less of.
         min_area_px: So are pairs of which the convex hull of one silhouette covers fewer pixels of image or patch.
         images: Most images to cut, evenly spread over those that are there; 0 cuts all.
+        images_per_scene: So many images of a BOP scene, one after the other, count as one scene (training holds out
+            whole ones). 0: all of them where there are several BOP scenes, else each by itself.
         window: `diameter` follows the hypothesis' distance and shows every pose as large, for networks whose own window
             does so; `fixed` is the paper's, of one side for all poses of an object.
         scale: Side of a diameter window over the projected diameter. Larger than the network's own, which is cut out
@@ -36,6 +38,7 @@ class CutConfig:
     min_visible: float = 0.1
     min_area_px: float = 150.0
     images: int = 0
+    images_per_scene: int = 0
     window: Literal["diameter", "fixed"] = "diameter"
     scale: float = 2.0
     padding: float = 0.3
@@ -50,5 +53,6 @@ class CutConfig:
         check("min_visible", self.min_visible, 0.0, 1.0)
         check("min_area_px", self.min_area_px, 1.0)
         check("images", self.images, 0)
+        check("images_per_scene", self.images_per_scene, 0)
         check("scale", self.scale, 1.0, 8.0)
         check("padding", self.padding, 0.0, 4.0)
