@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -46,8 +47,6 @@ def make_mesh(path: Path) -> Mesh:
 
 def background(rng: np.random.Generator, photos: Sequence[np.ndarray] = ()) -> np.ndarray:
     """A piece of a photograph where there are any, else coloured noise."""
-    import cv2
-
     if not photos:
         coarse = rng.integers(0, 256, (int(rng.integers(3, 24)),) * 2 + (3,), dtype=np.uint8)
         return cv2.resize(coarse, (WIDTH_PX, HEIGHT_PX), interpolation=cv2.INTER_CUBIC)
@@ -202,7 +201,8 @@ def bop(tmp_path, mesh, frame):
 
 @pytest.fixture
 def two_images(bop, tmp_path):
-    """A dataset that has that image twice, four start poses, the first of them in the second image, and its file."""
+    """A dataset that has that image a second time, darker, and four start poses, the first of them in the second image;
+    and that image's file."""
     root, start = bop
     two = tmp_path / "two"
     shutil.copytree(root, two)
@@ -212,7 +212,7 @@ def two_images(bop, tmp_path):
         file.write_text(json.dumps({**content, "1": content["0"]}))
     (picture,) = (two / "test" / "000001" / "rgb").iterdir()
     second = picture.with_stem("000001")
-    shutil.copy(picture, second)
+    cv2.imwrite(str(second), cv2.imread(str(picture)) // 2)
     lines = start.read_text().splitlines()
     start.write_text("\n".join([lines[0], lines[1].replace("1,0,1", "1,1,1", 1), *lines[1:]]) + "\n")
     return two, start, second

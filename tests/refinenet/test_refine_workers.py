@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import psutil
 import pytest
@@ -60,6 +61,12 @@ def test_what_was_finished_before_a_damaged_image_is_kept(cli, two_images, train
     assert read_sidecar(out)["start_lines"] == [3, 4]
 
 
+def ignores_interrupts(pid):
+    """As the command does while it starts processes."""
+    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("SigIgn:"))
+    return bool(int(line.split()[1], 16) & 1 << (signal.SIGINT - 1))
+
+
 def begun(arguments):
     """The command in a process of its own, once both of its workers are there."""
     command = [sys.executable, "-m", "refinenet", "refine", *map(str, arguments)]
@@ -69,7 +76,7 @@ def begun(arguments):
         workers = [
             child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())
         ]
-        if len(workers) == 2:
+        if len(workers) == 2 and not ignores_interrupts(process.pid):
             return process, workers
         time.sleep(0.05)
     process.kill()

@@ -33,7 +33,7 @@ from refinenet.baselines.search import (
 )
 from refinenet.baselines.sparse_views import sparse_views
 from refinenet.baselines.view import Target, look
-from refinenet.methods import Refinement, Request, Status, make_baseline
+from refinenet.methods import Frame, Refinement, Request, Status, make_baseline
 
 from .conftest import K, make_bop
 from .test_baselines import LMO_OBJECTS, distances, rendered_frame
@@ -243,7 +243,7 @@ def seen(tug):
         yield frame, truth, view, sparse_views(1, tug, rasteriser)
 
 
-def test_the_result_depends_on_image_and_start_alone(tug, seen):
+def test_what_is_found_alone_does_not_depend_on_other_poses(tug, seen):
     frame, truth, _, _ = seen
     requests = [Request(obj_id=1, T_cam_obj=far_start(truth, seed)) for seed in (0, 1)]
     refiner = make_baseline("search", {1: tug}, 2)
@@ -315,6 +315,66 @@ def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
         assert behind.confidence > 0.5
         assert behind.iterations > alone.iterations
         assert len(behind.tried) > len(alone.tried)
+
+
+def test_what_stays_failed_says_how_far_it_came(tug, covered):
+    """Beside the other object, which is found, there is nothing but noise."""
+    thing, ((frame, truth, front, known_m), *_) = covered
+    noise = np.random.default_rng(0).integers(0, 256, (15, 20, 3), dtype=np.uint8)
+    noise = cv2.resize(noise, frame.image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    frame = replace(frame, image=np.where(known_m[..., None] > 0, frame.image, noise))
+    refiner = make_baseline("search", {1: tug, 2: thing}, 2)
+    requests = [Request(obj_id=1, T_cam_obj=far_start(truth, 1)), Request(obj_id=2, T_cam_obj=front)]
+    missing, found = refiner.refine_batch(frame, requests)
+    (alone,) = refiner.refine_batch(frame, requests[:1])
+    refiner.close()
+    assert missing.failed
+    assert not found.failed
+    np.testing.assert_array_equal(missing.T_cam_obj, requests[0].T_cam_obj)
+    assert len(missing.tried) > len(alone.tried)
+    assert f" {missing.tried[-1].confidence:.3f} at most" in missing.failure
+    assert missing.tried[-1].confidence >= alone.tried[-1].confidence
+
+
+def test_poses_are_found_one_behind_the_other(tug, monkeypatch):
+    """Each of three only when those before are known; a fourth never."""
+    T = [se3.make_T(np.eye(3), np.array([0.1 * i, 0.0, 0.8 + 0.3 * i])) for i in range(4)]
+    asked = []
+
+    def refine(self, frame, T_cam_obj, target):
+        place, known = round(10 * T_cam_obj[0, 3]), 0 if target.known_m is None else int(target.known_m[0, 0])
+        asked.append((place, known))
+        if place < 3 and known >= place:
+            return Refinement(T_cam_obj=T_cam_obj, status=Status.STOPPED, iterations=1, confidence=0.9)
+        return failed(T_cam_obj, 1, "no")
+
+    monkeypatch.setattr(search_module.GradientSearch, "_refine", refine)
+    monkeypatch.setattr(
+        search_module.GradientSearch, "_known_m", lambda self, frame, request, found: np.full((1, 1), float(len(found)))
+    )
+    refiner = make_baseline("search", {1: tug}, 2)
+    frame = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
+    results = refiner.refine_batch(frame, [Request(obj_id=1, T_cam_obj=pose) for pose in T])
+    refiner.close()
+    assert [result.failed for result in results] == [False, False, False, True]
+    assert asked == [(0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (3, 1), (2, 2), (3, 2), (3, 3)]
+    assert [result.iterations for result in results] == [1, 2, 3, 4]
+
+
+def test_a_pose_of_the_same_object_from_another_start_hides_nothing(tug, mesh, seen):
+    frame, truth, _, _ = seen
+    nearer, aside = truth.copy(), truth.copy()
+    nearer[:3, 3] *= 0.9
+    aside[0, 3] += 0.7 * tug.diameter_m
+    refiner = make_baseline("search", {1: tug, 2: mesh}, 1)
+    refiner.refine_batch(frame, [Request(obj_id=i, T_cam_obj=truth) for i in (1, 2)])  # so that it can draw both
+
+    def hides(obj_id, pose):
+        found = [Request(obj_id=obj_id, T_cam_obj=pose)]
+        return bool((refiner._known_m(frame, Request(obj_id=1, T_cam_obj=truth), found) > 0).any())
+
+    assert (hides(1, nearer), hides(1, aside), hides(2, nearer)) == (False, True, True)
+    refiner.close()
 
 
 def test_the_truth_agrees_best(tug, seen):

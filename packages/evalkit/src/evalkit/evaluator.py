@@ -1,10 +1,10 @@
 """Dataset and result files to a table: one row for every expected pose, found or missing."""
 
-import multiprocessing
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
@@ -15,7 +15,7 @@ from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.camera import Camera
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
-from posecore.processes import behave_as_worker
+from posecore.processes import behave_as_worker, spawned
 from posecore.raster import Rasteriser
 
 from evalkit.files import load_result_files
@@ -82,6 +82,8 @@ class Evaluator:
         self.dataset, self.vss, self.with_vsd, self.workers = dataset, vss, with_vsd, workers
         self._scorer = Scorer(dataset, visible=vss == "visible", with_vsd=with_vsd)
         self._pool: ProcessPoolExecutor | None = None
+        self._closing = ExitStack()
+        self._closing.callback(self._scorer.rasteriser.close)
 
     def __enter__(self) -> "Evaluator":
         """Use in a with statement."""
@@ -89,9 +91,7 @@ class Evaluator:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         """Free the renderer and end the workers."""
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-        self._scorer.rasteriser.close()
+        self._closing.__exit__(kind, error, at)
 
     @property
     def rasteriser(self) -> Rasteriser:
@@ -126,13 +126,13 @@ class Evaluator:
         if self.workers == 1 or len(blocks) == 1:
             yield from ((place, self._scorer.score(block)) for place, block in enumerate(blocks))
             return
+        died = (
+            f"a process that scored {self.dataset.root} died (out of memory, or a crash in the renderer); "
+            "start the same command again with fewer --workers"
+        )
         if self._pool is None:
-            self._pool = ProcessPoolExecutor(
-                self.workers,
-                mp_context=multiprocessing.get_context("spawn"),
-                initializer=_start_worker,
-                initargs=(self.dataset.root, self.dataset.split, self.dataset.sensor, self.vss, self.with_vsd),
-            )
+            given = (self.dataset.root, self.dataset.split, self.dataset.sensor, self.vss, self.with_vsd)
+            self._pool = self._closing.enter_context(spawned(self.workers, _start_worker, given, died))
         waiting = dict(reversed(list(enumerate(blocks))))
         running: dict[Future[pd.DataFrame], int] = {}
         while waiting or running:
@@ -143,10 +143,7 @@ class Evaluator:
                 try:
                     yield running.pop(future), future.result()
                 except BrokenProcessPool as error:
-                    raise RenderError(
-                        f"a process that scored {self.dataset.root} died (out of memory, or a crash in the renderer); "
-                        "start the same command again with fewer --workers"
-                    ) from error
+                    raise RenderError(died) from error
 
     def all_errors(
         self, estimates: Sequence[Estimate], known: tuple[Sequence[Pair], pd.DataFrame] | None = None

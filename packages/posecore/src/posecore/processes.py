@@ -80,9 +80,12 @@ def spawned(
         except BrokenProcessPool as error:
             raise RenderError(died) from error
         except BaseException:
+            results: Any = pool._result_queue  # nothing public ends a task that runs
             pool.shutdown(wait=False, cancel_futures=True)
             for process in set(multiprocessing.active_children()) - others:
-                process.kill()  # else it would go on to the end of its task
+                process.kill()
+                process.join()
+            results._writer.close()  # else the pool would wait for the rest of a result that a process was writing
             raise
 
 

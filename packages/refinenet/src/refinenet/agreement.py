@@ -29,14 +29,14 @@ def gradient_agreement(
     An edge pixel of the render, silhouette included, counts with the cosine of twice the angle between both gradients
     where the image has an edge too, and with 0 where it has none: equal and opposite gradients count 1, perpendicular
     ones -1, and orientations that have nothing to do with each other cancel. (The mean of the absolute cosine itself,
-    as in LINE-2D, would be 0.64 for those.) A negative mean is 0. Where more than half of the silhouette lies outside
-    of the image the mean is over few pixels and counts less, down to 0 where nothing lies inside.
+    as in LINE-2D, would be 0.64 for those.) A negative mean is 0. Where more than half of the silhouette cannot be seen
+    the mean is over few pixels and counts less, down to 0 where nothing can.
 
     Args:
         scene_rgb: Patches of the image.
         hypothesis_rgb: Renders on black in the same windows.
         mask: Their silhouettes.
-        inside: Patch pixels that lie in the image.
+        inside: Patch pixels that lie in the image, and are not known to show something in front.
     """
     render, strength = render_gradients(hypothesis_rgb, mask)
     scene, scene_strength = gradients(scene_rgb.astype(np.float32))

@@ -80,7 +80,7 @@ class Refined:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class OfImage:
+class ImageStarts:
     """The start poses in one image.
 
     Attributes:
@@ -104,24 +104,24 @@ class Results:
     taken_s: float
 
 
-def by_image(starts: Sequence[Estimate]) -> list[OfImage]:
+def by_image(starts: Sequence[Estimate]) -> list[ImageStarts]:
     """Start poses image by image, in the order of scenes and images."""
     order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
     images = []
     for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
         places = tuple(group)
         requests = tuple(Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in places)
-        images.append(OfImage(scene_id=scene_id, im_id=im_id, places=places, requests=requests))
+        images.append(ImageStarts(scene_id=scene_id, im_id=im_id, places=places, requests=requests))
     return images
 
 
 def add_results(
     refined: Refined,
     starts: Sequence[Estimate],
-    images: Sequence[OfImage],
+    images: Sequence[ImageStarts],
     results: Iterable[Results],
     *,
-    on_image: Callable[[OfImage, Results], None],
+    on_image: Callable[[ImageStarts, Results], None],
 ) -> None:
     """Add what comes of image after image to `refined`, so that an error on the way loses nothing.
 
@@ -159,7 +159,7 @@ class OverlayFolder:
         """Free what the renderer holds."""
         self._overlay.close()
 
-    def write(self, image: OfImage, results: Results) -> None:
+    def write(self, image: ImageStarts, results: Results) -> None:
         """Draw one image."""
         K = self._dataset.camera(image.scene_id, image.im_id).K
         rgb = self._dataset.rgb(image.scene_id, image.im_id)

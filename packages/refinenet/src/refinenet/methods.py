@@ -102,8 +102,8 @@ class Refinement:
         iterations: Updates that were applied.
         confidence: In [0, 1], 0 where it failed; None from a method that has none.
         failure: Why it failed, without a full stop; None where it did not.
-        tried: Every pose that was weighed on the way, with the confidence that it got; none from a method that follows
-            one pose.
+        tried: Every pose that was weighed on the way, with the confidence that it got, those of the search that it is
+            from last; none from a method that follows one pose.
     """
 
     T_cam_obj: Float[Array, "4 4"]

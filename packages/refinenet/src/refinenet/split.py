@@ -130,7 +130,10 @@ def held_out_scenes(
         raise ShardError(f"{url}: no finished shard; let `synthgen render` write one first, or wait with --follow")
     scenes = scenes_in(scene_of)
     if len(scenes) < 2:
-        raise ShardError(f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples")
+        raise ShardError(
+            f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples, or cut with a "
+            "smaller images_per_scene"
+        )
     if growing and 0 < len(drawn := drawn_out(scenes, share, seed)) < len(scenes):
         return drawn
     held = max(1, min(len(scenes) - 1, round(share * len(scenes))))

@@ -9,7 +9,7 @@ from posecore.camera import back_project
 from posecore.errors import DatasetError
 
 from refinenet.baselines.outcome import Baseline, failed, refined
-from refinenet.baselines.view import Target, View, finest_px, look
+from refinenet.baselines.view import Target, View, at_nearest, finest_px, look
 from refinenet.methods import Frame, Refinement
 
 Array = np.ndarray
@@ -83,10 +83,7 @@ def _look(frame: Frame, pose: Float[Array, "4 4"], target: Target) -> View | Non
 
 def _scene_depth_m(view: View, depth_m: Float[Array, "h w"]) -> Float[Array, "p p"]:
     """The image's depth at the patch's pixel centres, of the nearest pixel; 0 outside."""
-    centre = (np.arange(len(view.depth_m)) + 0.5) * view.window.side_px / len(view.depth_m)
-    rows = np.floor(view.window.y0_px + centre).astype(int).clip(0, depth_m.shape[0] - 1)
-    columns = np.floor(view.window.x0_px + centre).astype(int).clip(0, depth_m.shape[1] - 1)
-    return np.where(view.seeable, depth_m[rows[:, None], columns], 0.0)
+    return np.where(view.seeable, at_nearest(depth_m, view.window, len(view.depth_m)), 0.0)
 
 
 def _on_the_surface(

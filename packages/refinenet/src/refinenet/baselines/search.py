@@ -58,6 +58,8 @@ LEASH = 0.01
 """Agreement that a pose must have more for a standard deviation further from the start, squared."""
 BEYOND_RAD = 0.2
 """The standard deviation of angles beyond the largest that was drawn; under it, all are as likely."""
+OWN = 0.5
+"""A found pose of the same object is another one's if it is so many diameters aside of the start."""
 MIN_AGREEMENT, MIN_FIT = 0.4, 0.5
 """In the end, below which a pose is more likely wrong than right, and mostly worse than its start: the agreement of
 gradients, or its mean with the closeness that a network tells."""
@@ -114,26 +116,38 @@ class GradientSearch(Baseline):
         results = super().refine_batch(frame, requests)
         known = 0
         while known < (found := sum(not result.failed for result in results)) < len(results):
-            known, known_m = found, self._known_m(frame, requests, results)
-            for i, (request, first) in enumerate(zip(requests, results, strict=True)):
-                if first.failed:
-                    again = self._refine(frame, request.T_cam_obj, replace(self._target(request), known_m=known_m))
-                    results[i] = replace(
-                        first if again.failed else again,
-                        iterations=first.iterations + again.iterations,
-                        tried=(*first.tried, *again.tried),
-                    )
+            known = found
+            poses = [
+                Request(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
+                for request, result in zip(requests, results, strict=True)
+                if not result.failed
+            ]
+            for i, (request, before) in enumerate(zip(requests, results, strict=True)):
+                if before.failed:
+                    target = replace(self._target(request), known_m=self._known_m(frame, request, poses))
+                    again = self._refine(frame, request.T_cam_obj, target)
+                    worse, better = sorted((again, before), key=_final_confidence)
+                    done = before.iterations + again.iterations
+                    results[i] = replace(better, iterations=done, tried=(*worse.tried, *better.tried))
         return results
 
-    def _known_m(self, frame: Frame, requests: Sequence[Request], results: Sequence[Refinement]) -> Float[Array, "h w"]:
-        """Camera z of what was found, 0 elsewhere."""
-        found = [
-            Instance(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
-            for request, result in zip(requests, results, strict=True)
-            if not result.failed
-        ]
+    def _known_m(self, frame: Frame, request: Request, found: Sequence[Request]) -> Float[Array, "h w"]:
+        """Camera z of what was found beside an object that is looked for, 0 elsewhere.
+
+        Poses of the same object near the start pose are left out: they may be this one's, found from another start.
+        """
+        mesh = self._meshes[request.obj_id]
+        start_m = se3.apply(request.T_cam_obj, mesh.center_m[None])[0]
+        beside = []
+        for other in found:
+            centre_m = se3.apply(other.T_cam_obj, self._meshes[other.obj_id].center_m[None])[0]
+            aside_m = np.linalg.norm(centre_m[:2] * start_m[2] / centre_m[2] - start_m[:2])
+            if other.obj_id != request.obj_id or aside_m > OWN * mesh.diameter_m:
+                beside.append(Instance(obj_id=other.obj_id, T_cam_obj=other.T_cam_obj))
         height_px, width_px = frame.image.shape[:2]
-        return self._quick.render_scene(found, frame.K, width_px, height_px, rgb=False).depth_m
+        if not beside:
+            return np.zeros((height_px, width_px), np.float32)
+        return self._quick.render_scene(beside, frame.K, width_px, height_px, rgb=False).depth_m
 
     def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
         start = np.ascontiguousarray(T_cam_obj, np.float64)
@@ -188,6 +202,11 @@ class GradientSearch(Baseline):
 
 def _confidence(found: Refinement) -> float:
     return found.confidence or 0.0
+
+
+def _final_confidence(found: Refinement) -> float:
+    """Also of one that failed, for not being confident enough."""
+    return max(_confidence(found), _confidence(found.tried[-1]) if found.tried else 0.0)
 
 
 def agreement_of(frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> float:

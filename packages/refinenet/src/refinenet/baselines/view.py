@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from posecore.camera import back_project, crop_K
 from posecore.contour import trace
 from posecore.mesh import Mesh
@@ -116,11 +116,10 @@ def look(
     assert layers.rgb is not None
     mask, depth_m, seen_until_m = layers.mask[0], layers.depth_m[0], np.where(in_image, np.inf, 0.0)
     if target.known_m is not None:
-        rows, columns = (np.floor(x).astype(int) for x in (v_px, u_px))
-        known_m = target.known_m[rows.clip(0, height_px - 1)[:, None], columns.clip(0, width_px - 1)]
+        known_m = at_nearest(target.known_m, window, patch_px)
         seen_until_m = np.where(in_image & (known_m > 0), known_m, seen_until_m)
-    centre_m = T_cam_obj[2, :3] @ target.mesh.center_m + T_cam_obj[2, 3]
-    seeable = seen_until_m > np.where(mask, depth_m, centre_m)
+    centre_z_m = T_cam_obj[2, :3] @ target.mesh.center_m + T_cam_obj[2, 3]
+    seeable = seen_until_m > np.where(mask, depth_m, centre_z_m)
     if not (mask & seeable).any():
         return None
     return View(
@@ -132,6 +131,14 @@ def look(
         seen_until_m=seen_until_m,
         seeable=seeable,
     )
+
+
+def at_nearest(values: Shaped[Array, "h w"], window: Window, patch_px: int) -> Shaped[Array, "p p"]:
+    """An image's values at the pixel that is nearest to each of the window's patch; beyond the image its border's."""
+    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
+    rows = np.floor(window.y0_px + centre).astype(int).clip(0, values.shape[0] - 1)
+    columns = np.floor(window.x0_px + centre).astype(int).clip(0, values.shape[1] - 1)
+    return np.asarray(values[rows[:, None], columns])
 
 
 def _cut(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:

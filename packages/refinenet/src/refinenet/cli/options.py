@@ -27,7 +27,7 @@ threads_option = click.option(
 )
 workers_option = click.option(
     "--workers", type=click.IntRange(1), default=1,
-    help="Processes that refine images side by side, each with one torch thread where --threads does not say.",
+    help="Processes that refine images side by side; several have one torch thread each if --threads does not say.",
 )  # fmt: skip
 iterations_option = click.option(
     "--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose; fewer once one is small."

@@ -129,8 +129,8 @@ def refine(
     from posecore.files import require_writable
 
     from refinenet import checkpoint as checkpoints
-    from refinenet.estimates import OfImage, OverlayFolder, Refined, Results, add_results, by_image, make_sidecar
-    from refinenet.recipe import Recipe, refined_by_workers, refined_here
+    from refinenet.estimates import ImageStarts, OverlayFolder, Refined, Results, add_results, by_image, make_sidecar
+    from refinenet.workers import MethodSettings, refined_by_workers, refined_here
 
     if threads:
         torch.set_num_threads(threads)
@@ -146,12 +146,12 @@ def refine(
     for path in filter(None, (out, candidates)):
         require_writable(path)
     obj_ids = tuple(sorted({s.obj_id for s in starts}))
-    recipe = Recipe(
+    settings = MethodSettings(
         dataset=dataset, split=bop.split, obj_ids=obj_ids, method=method, checkpoint=checkpoint, iterations=iterations,
         device=device, batch=batch, allow_other_mesh=allow_other_mesh, min_confidence=min_confidence,
         hypotheses=hypotheses, scorer=scorer, seed=seed, threads=threads,
     )  # fmt: skip
-    refiner = recipe.make(bop, loaded)
+    refiner = settings.make(bop, loaded)
     result, stopped, images = Refined(keep_failed=keep_failed), None, by_image(starts)
     try:
         with ExitStack() as stack:
@@ -160,13 +160,13 @@ def refine(
             bar = stack.enter_context(progress_bar(quiet))
             task = bar.add_task("poses", total=len(starts))
 
-            def after(image: OfImage, results: Results) -> None:
+            def after(image: ImageStarts, results: Results) -> None:
                 if painter:
                     painter.write(image, results)
                 bar.advance(task, len(image.places))
 
-            if workers > 1:
-                results = stack.enter_context(refined_by_workers(recipe, images, workers))
+            if (side_by_side := min(workers, len(images))) > 1:
+                results = stack.enter_context(refined_by_workers(settings, images, side_by_side))
             else:
                 results = refined_here(bop, refiner, images)
             add_results(result, starts, images, results, on_image=after)

@@ -1,4 +1,4 @@
-"""What `refinenet refine` makes its method from, and the processes that refine images side by side with it."""
+"""Images refined one after the other, or side by side by processes that each make the method for themselves."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from posecore.processes import behave_as_worker, in_order, spawned
 from refinenet import checkpoint as checkpoints
 from refinenet.checkpoint import Checkpoint
 from refinenet.data import prepare_worker
-from refinenet.estimates import OfImage, Results, load_frame
+from refinenet.estimates import ImageStarts, Results, load_frame
 from refinenet.methods import NETWORK, PoseRefiner, make_baseline
 from refinenet.pool import PooledRefiner, PoolScorer
 from refinenet.refine import Refiner
@@ -22,8 +22,8 @@ AHEAD = 2
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recipe:
-    """A method and its settings.
+class MethodSettings:
+    """What `refinenet refine` makes its method from.
 
     Attributes:
         dataset: BOP dataset with the meshes and images.
@@ -74,7 +74,7 @@ class Recipe:
         return network if self.hypotheses == 1 else PooledRefiner(network, self.hypotheses, self.scorer, self.seed)
 
 
-def refined_here(bop: BopDataset, method: PoseRefiner, images: Sequence[OfImage]) -> Iterator[Results]:
+def refined_here(bop: BopDataset, method: PoseRefiner, images: Sequence[ImageStarts]) -> Iterator[Results]:
     """Results of image after image, as they are asked for."""
     for image in images:
         frame = load_frame(bop, image.scene_id, image.im_id, method)
@@ -84,31 +84,40 @@ def refined_here(bop: BopDataset, method: PoseRefiner, images: Sequence[OfImage]
 
 
 @contextmanager
-def refined_by_workers(recipe: Recipe, images: Sequence[OfImage], workers: int) -> Iterator[Iterator[Results]]:
-    """The same, in the same order, from processes that each make the method for themselves.
+def refined_by_workers(
+    settings: MethodSettings, images: Sequence[ImageStarts], workers: int
+) -> Iterator[Iterator[Results]]:
+    """The same, in the same order, from processes.
 
     Raises:
         RenderError: One died.
     """
     died = (
-        f"{recipe.dataset}: a process that refined its images died (out of memory, or a crash in the renderer); "
+        f"{settings.dataset}: a process that refined its images died (out of memory, or a crash in the renderer); "
         "start again with fewer --workers"
     )
-    with spawned(min(workers, len(images)), _start_worker, (recipe,), died) as pool:
+    with spawned(workers, _start_worker, (settings,), died) as pool:
         yield in_order(pool, _in_worker, images, AHEAD * workers)
 
 
-_worker: list[tuple[BopDataset, PoseRefiner]] = []
+class _Worker:
+    """What a process holds: the settings, and what it makes of them for its first image."""
+
+    settings: MethodSettings
+    made: tuple[BopDataset, PoseRefiner] | None = None
 
 
-def _start_worker(recipe: Recipe) -> None:
+def _start_worker(settings: MethodSettings) -> None:
     behave_as_worker()
-    prepare_worker(max(recipe.threads, 1))
-    bop = BopDataset(recipe.dataset, recipe.split)
-    loaded = None if recipe.checkpoint is None else checkpoints.load(recipe.checkpoint)
-    _worker[:] = [(bop, recipe.make(bop, loaded))]
+    prepare_worker(max(settings.threads, 1))
+    _Worker.settings = settings
 
 
-def _in_worker(image: OfImage) -> Results:
-    (results,) = refined_here(*_worker[0], [image])
+def _in_worker(image: ImageStarts) -> Results:
+    if _Worker.made is None:  # here, and not at the start, for here an error reaches the user
+        settings = _Worker.settings
+        bop = BopDataset(settings.dataset, settings.split)
+        loaded = None if settings.checkpoint is None else checkpoints.load(settings.checkpoint)
+        _Worker.made = (bop, settings.make(bop, loaded))
+    (results,) = refined_here(*_Worker.made, [image])
     return results
