@@ -241,7 +241,7 @@ EXPERIMENT = Experiment(
     paper=PROTOCOL.paper,
     minutes={
         "smoke": "about ten minutes on two CPU cores",
-        "small": "about five hours on two CPU cores",
+        "small": "about two and a half hours on two CPU cores",
         "full": "days, most of them rendering; a GPU",
     },
     plan=plan,

@@ -67,15 +67,20 @@ def ignores_interrupts(pid):
     return bool(int(line.split()[1], 16) & 1 << (signal.SIGINT - 1))
 
 
+def is_worker(child):
+    try:
+        return "spawn_main" in " ".join(child.cmdline())
+    except psutil.Error:  # it ended meanwhile
+        return False
+
+
 def begun(arguments):
     """The command in a process of its own, once both of its workers are there."""
     command = [sys.executable, "-m", "refinenet", "refine", *map(str, arguments)]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
-        workers = [
-            child for child in psutil.Process(process.pid).children() if "spawn_main" in " ".join(child.cmdline())
-        ]
+        workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
         if len(workers) == 2 and not ignores_interrupts(process.pid):
             return process, workers
         time.sleep(0.05)

@@ -299,13 +299,34 @@ def test_what_is_known_to_be_in_front_does_not_count(tug, covered):
             assert look(frame.image, frame.K, truth, wall, 96) is None
 
 
+class Knowing(Given):
+    """Stands for a network that leaves poses as they are, and tells how close they are to the truth."""
+
+    tells_closeness = True
+
+    def __init__(self, truths):
+        super().__init__()
+        self.truths = truths
+
+    def refine_batch(self, frame, requests):
+        mesh_and_truth = [self.truths[request.obj_id] for request in requests]
+        return [
+            Refinement(
+                T_cam_obj=r.T_cam_obj, status=Status.STOPPED, iterations=1,
+                confidence=float(np.exp(-distances(mesh, truth, r.T_cam_obj) / 0.06)),
+            )
+            for r, (mesh, truth) in zip(requests, mesh_and_truth, strict=True)
+        ]  # fmt: skip
+
+
 def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
     thing, frames = covered
     for frame, truth, front, _ in frames:
         start = Request(obj_id=1, T_cam_obj=far_start(truth, 1))
         rng = np.random.default_rng(0)
         near = Request(obj_id=2, T_cam_obj=se3.perturb(front, np.deg2rad(6), 0.05 * thing.diameter_m, rng))
-        refiner = make_baseline("search", {1: tug, 2: thing}, 2)
+        knowing = Knowing({1: (tug, truth), 2: (thing, front)})
+        refiner = make_baseline("search", {1: tug, 2: thing}, 2, network=knowing)
         (alone,) = refiner.refine_batch(frame, [start])
         behind, before = refiner.refine_batch(frame, [start, near])
         refiner.close()
@@ -315,6 +336,10 @@ def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
         assert behind.confidence > 0.5
         assert behind.iterations > alone.iterations
         assert len(behind.tried) > len(alone.tried)
+        refiner = make_baseline("search", {1: tug, 2: thing}, 2)  # gradients alone do not look again
+        unjudged, _ = refiner.refine_batch(frame, [start, near])
+        refiner.close()
+        assert unjudged.failed
 
 
 def test_what_stays_failed_says_how_far_it_came(tug, covered):
@@ -323,7 +348,7 @@ def test_what_stays_failed_says_how_far_it_came(tug, covered):
     noise = np.random.default_rng(0).integers(0, 256, (15, 20, 3), dtype=np.uint8)
     noise = cv2.resize(noise, frame.image.shape[1::-1], interpolation=cv2.INTER_CUBIC)
     frame = replace(frame, image=np.where(known_m[..., None] > 0, frame.image, noise))
-    refiner = make_baseline("search", {1: tug, 2: thing}, 2)
+    refiner = make_baseline("search", {1: tug, 2: thing}, 2, network=Knowing({1: (tug, truth), 2: (thing, front)}))
     requests = [Request(obj_id=1, T_cam_obj=far_start(truth, 1)), Request(obj_id=2, T_cam_obj=front)]
     missing, found = refiner.refine_batch(frame, requests)
     (alone,) = refiner.refine_batch(frame, requests[:1])
@@ -352,7 +377,7 @@ def test_poses_are_found_one_behind_the_other(tug, monkeypatch):
     monkeypatch.setattr(
         search_module.GradientSearch, "_known_m", lambda self, frame, request, found: np.full((1, 1), float(len(found)))
     )
-    refiner = make_baseline("search", {1: tug}, 2)
+    refiner = make_baseline("search", {1: tug}, 2, network=Mover(None))
     frame = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
     results = refiner.refine_batch(frame, [Request(obj_id=1, T_cam_obj=pose) for pose in T])
     refiner.close()

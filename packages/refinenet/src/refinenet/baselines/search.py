@@ -8,7 +8,9 @@ strategy. What agrees best is often not the truth, but the truth is mostly among
 starts from several, a network follows where one is given, and renders decide, with the network where it was trained to.
 
 What hides an object has edges of its own, which count against the truth and for other poses. Often it is an object that
-is looked for as well: what was found is known for those that were not, and they are searched for once more.
+is looked for as well: what was found is known for those that were not, and they are searched for once more. Fewer edges
+agree more easily by chance, so this is left to a network that tells closeness: most poses that gradients alone found so
+in crowded rendered frames were wrong.
 """
 
 import zlib
@@ -66,13 +68,13 @@ gradients, or its mean with the closeness that a network tells."""
 
 
 class GradientSearch(Baseline):
-    """`--method search`. Draws depend on the start pose alone; what was found in the same image may help.
+    """`--method search`. Draws depend on the start pose alone.
 
     Args:
         meshes: Objects by id.
         iterations: Of the edge ICP in the end.
         network: Refines what edge ICP makes of each candidate; closed with this. One that tells closeness is asked
-            which of them is right as well, beside the agreement of gradients.
+            which of them is right as well, beside the agreement of gradients, and what fails is looked for again.
         min_confidence: A pose that is less confident failed; `MIN_AGREEMENT` by default, `MIN_FIT` with a network that
             tells closeness.
     """
@@ -112,10 +114,10 @@ class GradientSearch(Baseline):
         super().close()
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
-        """Refine poses in one image: each for itself, then those that failed, behind what was found."""
+        """Refine poses in one image: each for itself, then, if they are judged, those that failed, behind the found."""
         results = super().refine_batch(frame, requests)
         known = 0
-        while known < (found := sum(not result.failed for result in results)) < len(results):
+        while self._judged and known < (found := sum(not result.failed for result in results)) < len(results):
             known = found
             poses = [
                 Request(obj_id=request.obj_id, T_cam_obj=result.T_cam_obj)
