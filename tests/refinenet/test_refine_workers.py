@@ -77,7 +77,13 @@ def is_worker(child):
 def begun(arguments):
     """The command in a process of its own, once both of its workers are there."""
     command = [sys.executable, "-m", "refinenet", "refine", *map(str, arguments)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    process = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job inherits it ignored
+    )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline:
         workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
