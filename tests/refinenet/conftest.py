@@ -133,6 +133,12 @@ def mesh(tmp_path_factory: pytest.TempPathFactory) -> Mesh:
 
 
 @pytest.fixture(scope="session")
+def tug(tug_ply: Path) -> Mesh:
+    """The example object."""
+    return load_mesh(tug_ply)
+
+
+@pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory, mesh: Mesh) -> Path:
     """48 pairs in 6 shards of 64 px patches."""
     return make_dataset(tmp_path_factory.mktemp("data") / "shards", mesh, 48, 8, 64)

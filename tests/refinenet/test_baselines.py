@@ -112,11 +112,6 @@ def test_a_symmetric_object_converges_to_one_of_its_poses(bobbin_ply, name):
     assert np.median(after) < 0.7 * np.median(before)
 
 
-@pytest.fixture(scope="module")
-def tug(tug_ply):
-    return load_mesh(tug_ply)
-
-
 @pytest.mark.parametrize("name", sorted(BASELINES))
 @pytest.mark.parametrize("t_m", [(0, 0, -0.5), (0, 0, 0.01), (5.0, 0, 0.7), (0, 0, np.nan), (0, 0, 60.0)])
 def test_a_pose_that_shows_nothing_fails_and_is_returned(tug, name, t_m):
