@@ -66,6 +66,15 @@ def test_overrides_are_read_as_yaml() -> None:
             config.apply_overrides(base, [wrong])
 
 
+def test_an_override_may_be_a_group_and_is_laid_over_what_is_there() -> None:
+    base = {"n": 1, "light": {"power_w": 1.0, "rgb": [1, 1, 1]}}
+    overrides = ["light={power_w: 2}", "kind=b", "camera={fx_px: 5, size: {w: 1, h: 2}}"]
+    found = config.apply_overrides(base, overrides)
+    assert found["light"] == {"power_w": 2, "rgb": [1, 1, 1]}
+    assert found["camera"] == {"fx_px": 5, "size": {"w": 1, "h": 2}}
+    assert config.assigned_keys(overrides) == ["light.power_w", "kind", "camera.fx_px", "camera.size.w", "camera.size.h"]
+
+
 def test_merge_lays_groups_over_groups() -> None:
     merged = config.merge({"n": 1, "light": {"power_w": 1, "rgb": [1, 1, 1]}}, {"light": {"power_w": 2}})
     assert merged == {"n": 1, "light": {"power_w": 2, "rgb": [1, 1, 1]}}

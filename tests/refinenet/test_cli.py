@@ -59,6 +59,7 @@ def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
         ),
         (["--backbone-weights", "stem.safetensors"], 2, "network.backbone.weights changes nothing here"),
         (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share=0.5 or so"),
+        (["--set", "own_predictions={updates: 2}"], 2, "own_predictions.updates changes nothing here"),
         (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
         (["--set", "optimiser.lr=.inf"], 2, "lr is inf"),

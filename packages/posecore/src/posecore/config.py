@@ -38,7 +38,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
 
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    """Return a copy with `a.b=value` assignments applied; values are read as YAML.
+    """Return a copy with `a.b=value` assignments applied; values are read as YAML, groups are laid over what is there.
 
     Raises:
         ConfigError: An assignment without `=` or through something that is not a group of keys.
@@ -58,8 +58,21 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
             target = target.setdefault(group, {})
             if not isinstance(target, dict):
                 raise ConfigError(f"--set {assignment}: {group} is a value, not a group of keys")
-        target[leaf] = value
+        below = target.get(leaf)
+        target[leaf] = merge(below, value) if isinstance(below, dict) and isinstance(value, Mapping) else value
     return result
+
+
+def assigned_keys(overrides: Sequence[str]) -> list[str]:
+    """The keys, with dots between groups, that assignments give a value to; those of a group each."""
+    return _leaves(apply_overrides({}, overrides), "")
+
+
+def _leaves(mapping: Mapping[str, Any], prefix: str) -> list[str]:
+    found: list[str] = []
+    for key, value in mapping.items():
+        found += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
+    return found
 
 
 def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

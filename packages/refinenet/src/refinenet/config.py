@@ -443,9 +443,9 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
     if file is not None:
         mapping = posecore_config.merge(mapping, posecore_config.load_yaml(file))
         where = str(file)
-    full = [f"network.{item}" if item.startswith("backbone.") else item for item in overrides]
+    full = [f"network.{item}" if item.startswith(("backbone.", "backbone=")) else item for item in overrides]
     config = posecore_config.build(TrainConfig, posecore_config.apply_overrides(mapping, full), where)
-    _require_used(config, [item.partition("=")[0] for item in full])
+    _require_used(config, posecore_config.assigned_keys(full))
     return config
 
 

@@ -73,7 +73,7 @@ def cut(
 
     given = {key: value for key, value in values.items() if value is not None}
     mapping = config_tools.apply_overrides({}, overrides) | given
-    config = config_tools.build(CutConfig, mapping, "--set")
+    config = config_tools.build(CutConfig, mapping, "settings")
     if split is None and len(there := splits_of(dataset)) > 1:
         raise click.UsageError(
             f"{dataset} has the splits {', '.join(there)}: name one with --split, not one that you report results on"
