@@ -72,7 +72,8 @@ def test_an_override_may_be_a_group_and_is_laid_over_what_is_there() -> None:
     found = config.apply_overrides(base, overrides)
     assert found["light"] == {"power_w": 2, "rgb": [1, 1, 1]}
     assert found["camera"] == {"fx_px": 5, "size": {"w": 1, "h": 2}}
-    assert config.assigned_keys(overrides) == ["light.power_w", "kind", "camera.fx_px", "camera.size.w", "camera.size.h"]
+    keys = ["light.power_w", "kind", "camera.fx_px", "camera.size.w", "camera.size.h"]
+    assert config.assigned_keys(overrides) == keys
 
 
 def test_merge_lays_groups_over_groups() -> None:

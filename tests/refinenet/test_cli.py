@@ -11,10 +11,11 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 
 from .test_data import split_by_scene
 
-SMALL = [
+SHORT = [
     "--steps", "2", "--batch", "4", "--workers", "0", "--threads", "1", "--set", "loss.contour_points=32",
-    "--set", "validation.pairs=4", "--set", "network.encoder=[8, 8]", "--set", "network.widths=[16, 16]",
+    "--set", "validation.pairs=4",
 ]  # fmt: skip
+SMALL = [*SHORT, "--set", "network.encoder=[8, 8]", "--set", "network.widths=[16, 16]"]
 
 
 def test_every_command_shows_an_example(cli):
@@ -59,6 +60,9 @@ def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
         ),
         (["--backbone-weights", "stem.safetensors"], 2, "network.backbone.weights changes nothing here"),
         (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share=0.5 or so"),
+        (["--preset", "paper", "--set", "network.widths=[8, 8]"], 2, "it needs network.kind=compact, plus or flow"),
+        (["--preset", "flow", "--set", "network.hidden=8"], 2, "it needs network.kind=compact or plus"),
+        (["--set", "optimiser.name=adam", "--set", "optimiser.weight_decay=1"], 2, "it needs optimiser.name=adamw"),
         (["--set", "own_predictions={updates: 2}"], 2, "own_predictions.updates changes nothing here"),
         (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
@@ -73,7 +77,8 @@ def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
     ],
 )
 def test_train_errors_are_one_line(cli, dataset, tmp_path, arguments, code, text):
-    result = cli("train", dataset, "--out", tmp_path / "run", *SMALL, *arguments)
+    size = SHORT if "--preset" in arguments else SMALL
+    result = cli("train", dataset, "--out", tmp_path / "run", *size, *arguments)
     assert result.exit_code == code, result.output
     assert text in result.stderr
     assert len(result.stderr.splitlines()) == 1

@@ -25,7 +25,7 @@ from torch.autograd import gradcheck
 
 from .conftest import K, background
 from .test_own_predictions import Moves
-from .test_train import small
+from .test_train import SMALL, small
 
 P = 96
 SURE = torch.tensor([1.0, 0.0, 1.0])
@@ -278,11 +278,12 @@ def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
 
 def flow_config(*overrides):
     """Preset `flow`, as small as it gets."""
-    return small(
+    of_every_kind = [item for item in SMALL if not item.startswith("network.hidden")]
+    own = [
         "loss.name=flow+point", "loss.point_weight=0.3", "network.kind=flow", "network.patch_px=64",
         "network.encoder=[8,16]", "network.match_radius=4", "network.widths=[24,24]", "optimiser.gradient_clip=20",
-        *overrides,
-    )  # fmt: skip
+    ]  # fmt: skip
+    return load_config("compact", [*of_every_kind, *own, *overrides])
 
 
 def batch_of(dataset, config, training=True, n=8):

@@ -457,7 +457,7 @@ def _require_used(config: TrainConfig, keys: Sequence[str]) -> None:
     Raises:
         ConfigError: There is one; it and what it needs are named.
     """
-    loss = config.loss.name
+    loss, kind = config.loss.name, config.network.kind
     switches = {
         "hypothesis.fresh=true": (config.hypothesis.fresh, ["hypothesis.any_twin", "hypothesis.in_plane"]),
         "network.confidence=true": (config.network.confidence, ["loss.confidence_"]),
@@ -465,7 +465,13 @@ def _require_used(config: TrainConfig, keys: Sequence[str]) -> None:
         "loader.workers=1 or more": (config.loader.workers, ["loader.prefetch"]),
     }
     choices = {
-        "network.kind=paper": (config.network.kind == "paper", ["network.backbone.", "network.branch_channels"]),
+        "network.kind=paper": (kind == "paper", ["network.backbone.", "network.branch_channels"]),
+        "network.kind=compact or plus": (kind in ("compact", "plus"), ["network.match_channels", "network.hidden"]),
+        "network.kind=compact, plus or flow": (
+            kind != "paper",
+            ["network.encoder", "network.match_radius", "network.appearance_channels", "network.widths"],
+        ),
+        "optimiser.name=adamw": (config.optimiser.name == "adamw", ["optimiser.weight_decay"]),
         "window.kind=diameter": (config.window.kind == "diameter", ["window.scale"]),
         "loss.name=mse": (loss == "mse", ["loss.gamma"]),
         "loss.name=point, contour+point or flow+point": ("point" in loss, ["loss.rotation_weight"]),
