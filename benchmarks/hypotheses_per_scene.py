@@ -23,10 +23,10 @@ from refinenet.config import TrainConfig, load_config
 from refinenet.data import PairSource
 from refinenet.device import choose_device
 from refinenet.held_out import validation_batches
-from refinenet.loss import ObjectPoints
 from refinenet.objects import load_models, object_points
 from refinenet.split import Split, spread_rows
 from refinenet.train import train
+from refinenet.twins import ObjectPoints
 
 PATCH_PX = 64
 TEST_PAIRS = 1024

@@ -14,12 +14,13 @@ from refinenet.config import load_config
 from refinenet.data import PairSource
 from refinenet.flow import offsets_to_px, surface_points, update_from_flow
 from refinenet.geometry import Flow
-from refinenet.loss import ObjectPoints, Target
+from refinenet.loss import Target
 from refinenet.methods import Status
 from refinenet.network import FlowNet, make_network
 from refinenet.own_predictions import OwnPredictions
 from refinenet.refine import Refiner
 from refinenet.trainer import Trainer
+from refinenet.twins import ObjectPoints
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
@@ -163,9 +164,9 @@ def targets(scenes):
 def points_of(mesh, *symmetries):
     every = np.stack([np.eye(4), *symmetries])
     points = mesh.vertices_m[:: len(mesh.vertices_m) // 40][None]
-    return ObjectPoints(
-        torch.from_numpy(points), torch.from_numpy(every)[None], torch.ones(1, len(every), dtype=torch.bool)
-    )
+    valid = torch.ones(1, len(every), dtype=torch.bool)
+    no_axes = torch.zeros(1, 0, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+    return ObjectPoints(torch.from_numpy(points), torch.from_numpy(every)[None], valid, *no_axes)
 
 
 def test_the_flow_loss_is_least_at_the_truth_and_the_certainty_of_the_errors_size(scenes, mesh):

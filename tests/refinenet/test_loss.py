@@ -5,8 +5,9 @@ from posecore import contour, se3
 from posecore.raster import Rasteriser
 from refinenet import geometry, loss
 from refinenet.geometry import PoseUpdate
-from refinenet.loss import ObjectPoints, Target
+from refinenet.loss import Target
 from refinenet.objects import farthest_points
+from refinenet.twins import ObjectPoints
 from torch.autograd import gradcheck
 
 PATCH_PX = 128
@@ -33,7 +34,8 @@ def object_points(mesh, symmetries=None):
     symmetries = np.eye(4)[None] if symmetries is None else symmetries
     points = farthest_points(mesh.vertices_m, 40)
     valid = torch.ones(1, len(symmetries), dtype=torch.bool)
-    return ObjectPoints(torch.from_numpy(points)[None], torch.from_numpy(symmetries)[None], valid)
+    no_axes = torch.zeros(1, 0, 3, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)
+    return ObjectPoints(torch.from_numpy(points)[None], torch.from_numpy(symmetries)[None], valid, *no_axes)
 
 
 @pytest.fixture(scope="module")

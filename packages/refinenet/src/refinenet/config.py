@@ -239,7 +239,8 @@ class LossConfig:
         rotation_weight: weight of the rotation within the point loss; image-plane position and depth have 1.
         contour_points: contour points used of each patch.
         model_points: model points of the point loss.
-        symmetry_step_deg: step at which continuous symmetries are sampled for the point loss.
+        symmetry_step_deg: step at which continuous symmetries are sampled, before the nearest sample is turned about
+            the axis the rest of the way.
         confidence_weight: weight of the confidence's cross-entropy, for a network with that output.
         confidence_target: what that output says of a hypothesis. `overlap`: how its silhouette fits what is visible of
             the object. `closeness`: how near it is to the truth as the camera sees it, turns included.

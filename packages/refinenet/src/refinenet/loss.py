@@ -4,12 +4,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from refinenet import geometry
 from refinenet.flow import offsets_to_px, weighted
 from refinenet.geometry import PoseUpdate
+from refinenet.twins import ObjectPoints, nearest_by_rotation
 
 
 class Target(NamedTuple):
@@ -42,24 +43,6 @@ class Target(NamedTuple):
     def mapped(self, change: Callable[[Tensor], Tensor]) -> "Target":
         """Every field that is there, changed."""
         return Target(*(x if x is None else change(x) for x in self))  # type: ignore[arg-type]
-
-
-class ObjectPoints(NamedTuple):
-    """Model points and symmetries of every object, padded to one shape.
-
-    Attributes:
-        points_m: (o, m, 3) points of each object, object frame.
-        symmetries: (o, s, 4, 4) transforms that leave the object as it is, the identity first.
-        valid: (o, s) which symmetries are real, not padding.
-    """
-
-    points_m: Float[Tensor, "o m 3"]
-    symmetries: Float[Tensor, "o s 4 4"]
-    valid: Bool[Tensor, "o s"]
-
-    def to(self, device: torch.device) -> "ObjectPoints":
-        """The same on another device."""
-        return ObjectPoints(*(x.to(device) for x in self))
 
 
 def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
@@ -123,8 +106,11 @@ def point_loss_px(
     Source: Labbe et al., CosyPose, ECCV 2020, and Simonelli et al., Disentangling Monocular 3D Object Detection.
     """
     predicted = geometry.apply_update(target.T_cam_obj_hypothesis, update)
-    rotation_m, T_true = _nearest_twin(predicted, target, objects)
+    T_true = nearest_by_rotation(predicted, target.T_cam_obj, target.object_index, objects)
     t_true = T_true[:, :3, 3]
+    points = objects.points_m[target.object_index]
+    turned = points @ (predicted[:, :3, :3] - T_true[:, :3, :3]).transpose(1, 2)
+    rotation_m = turned.abs().sum(-1).mean(-1)
 
     # Translations alone are compared at the true rotation: every model point moves alike, so one point stands for all.
     t = predicted[:, :3, 3]
@@ -136,19 +122,6 @@ def point_loss_px(
     return (rotation_weight * rotation_m + plane_m + depth_m) * px_per_m
 
 
-def _nearest_twin(
-    T_cam_obj: Float[Tensor, "b 4 4"], target: Target, objects: ObjectPoints
-) -> tuple[Float[Tensor, " b"], Float[Tensor, "b 4 4"]]:
-    """The truth's symmetric twin whose rotation is nearest to a pose's: mean L1 distance of points, and its pose."""
-    points = objects.points_m[target.object_index]
-    T_true = target.T_cam_obj[:, None] @ objects.symmetries[target.object_index]
-    wanted = torch.einsum("bsij,bmj->bsmi", T_true[..., :3, :3], points)
-    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2)
-    per_symmetry = (got[:, None] - wanted).abs().sum(-1).mean(-1)
-    distance_m, twin = per_symmetry.masked_fill(~objects.valid[target.object_index], torch.inf).min(-1)
-    return distance_m, T_true[torch.arange(len(twin), device=twin.device), twin]
-
-
 def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
     """Mean negative log likelihood of the true offsets of a hypothesis' visible surface, under `update.flow`.
 
@@ -157,7 +130,7 @@ def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Floa
     """
     flow = update.flow
     assert flow is not None
-    _, T_true = _nearest_twin(target.T_cam_obj_hypothesis, target, objects)
+    T_true = nearest_by_rotation(target.T_cam_obj_hypothesis, target.T_cam_obj, target.object_index, objects)
     true_px = offsets_to_px(flow, target.T_cam_obj_hypothesis, T_true, target.K_crop)
     error = weighted(flow.offset_px - true_px, flow.certainty)
     length = torch.sqrt(error.square().sum(-1) + 1e-4)
@@ -173,7 +146,7 @@ def closeness(target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
     What counts is the mean distance of projected model points, as a share of the object's box diagonal at the truth's
     depth, to the nearest symmetric twin.
     """
-    _, T_true = _nearest_twin(target.T_cam_obj_hypothesis, target, objects)
+    T_true = nearest_by_rotation(target.T_cam_obj_hypothesis, target.T_cam_obj, target.object_index, objects)
     points_m = objects.points_m[target.object_index]
     uv_px, true_px = (
         geometry.project(target.K_crop, points_m @ T[:, :3, :3].transpose(1, 2) + T[:, None, :3, 3])
@@ -228,7 +201,8 @@ def make_loss(
         confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
         confidence_target: what it is compared with, see `wanted_confidence`.
         min_closeness: hypotheses less close to the truth have no part in the loss but for their confidence.
-        objects: model points, for the losses with `point` in their name, and for closeness.
+        objects: model points and symmetries; only `mse`, and the contour losses of objects without symmetries, can do
+            without.
     """
 
     def flow(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
@@ -239,12 +213,23 @@ def make_loss(
         assert objects is not None
         return point_loss_px(update, target, objects, rotation_weight)
 
+    def twin(update: PoseUpdate, target: Target) -> Target:
+        """What contours are compared with: they look alike at every twin, and their poses must not differ."""
+        if objects is None or not objects.symmetric:
+            return target
+        predicted = geometry.apply_update(target.T_cam_obj_hypothesis, update)
+        T_true = nearest_by_rotation(predicted, target.T_cam_obj, target.object_index, objects)
+        return target._replace(T_cam_obj=T_true)
+
+    def contour(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+        return contour_loss_px(update, twin(update, target))
+
     table: dict[str, Callable[[PoseUpdate, Target], Float[Tensor, " b"]]] = {
-        "contour": contour_loss_px,
+        "contour": contour,
         "contour-forward": forward_contour_loss_px,
         "mse": lambda update, target: mse_loss(update, target, gamma),
         "point": points,
-        "contour+point": lambda update, target: contour_loss_px(update, target) + point_weight * points(update, target),
+        "contour+point": lambda update, target: contour(update, target) + point_weight * points(update, target),
         "flow+point": lambda update, target: flow(update, target) + point_weight * points(update, target),
     }
     pose = table[name]

@@ -15,7 +15,8 @@ from torch.utils.tensorboard import SummaryWriter
 
 from refinenet import geometry
 from refinenet.data import Batch
-from refinenet.loss import ObjectPoints, closeness, wanted_confidence
+from refinenet.loss import closeness, wanted_confidence
+from refinenet.twins import ObjectPoints, nearest_by_angle, nearest_by_points
 
 
 def pose_errors(
@@ -26,24 +27,18 @@ def pose_errors(
 ) -> dict[str, Float[Tensor, " b"]]:
     """Errors of each pose: rotation_deg, x_mm, y_mm, z_mm (absolute), add_mm (mean point distance).
 
-    Rotation and point distance are minimised over the object's symmetries.
+    All are those of the symmetric twin of the truth that is nearest: by angle for the rotation, else by points.
     """
-    wanted = T_true[:, None] @ objects.symmetries[object_index]
-    valid = objects.valid[object_index]
-    b, s = valid.shape
-    difference = T_cam_obj[:, None, :3, :3] @ wanted[..., :3, :3].transpose(-1, -2)
-    angle = geometry.rotation_angle_deg(difference.reshape(b * s, 3, 3)).reshape(b, s)
-    points = objects.points_m[object_index]
-    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2) + T_cam_obj[:, None, :3, 3]
-    true = torch.einsum("bsij,bmj->bsmi", wanted[..., :3, :3], points) + wanted[:, :, None, :3, 3]
-    distance = torch.linalg.vector_norm(got[:, None] - true, dim=-1).mean(-1)
-    move_mm = 1e3 * (T_cam_obj[:, :3, 3] - T_true[:, :3, 3]).abs()
+    twin = nearest_by_angle(T_cam_obj, T_true, object_index, objects)
+    angle_deg = geometry.rotation_angle_deg(T_cam_obj[:, :3, :3] @ twin[:, :3, :3].transpose(1, 2))
+    twin, distance_m = nearest_by_points(T_cam_obj, T_true, object_index, objects)
+    move_mm = 1e3 * (T_cam_obj[:, :3, 3] - twin[:, :3, 3]).abs()
     return {
-        "rotation_deg": angle.masked_fill(~valid, torch.inf).amin(-1),
+        "rotation_deg": angle_deg,
         "x_mm": move_mm[:, 0],
         "y_mm": move_mm[:, 1],
         "z_mm": move_mm[:, 2],
-        "add_mm": 1e3 * distance.masked_fill(~valid, torch.inf).amin(-1),
+        "add_mm": 1e3 * distance_m,
     }
 
 

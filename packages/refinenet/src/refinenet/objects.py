@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
 from posecore.mesh import Mesh
 from posecore.shard import ShardReader
 from posecore.simplify import simplified
+from posecore.symmetry import ball_center_m, is_ball
 
-from refinenet.loss import ObjectPoints
+from refinenet.twins import ObjectPoints
 
 
 def object_ids(reader: ShardReader) -> list[int]:
@@ -71,11 +73,30 @@ def object_points(
     width = max(len(S) for S in transforms)
     padded = [np.concatenate([S, np.tile(np.eye(4), (width - len(S), 1, 1))]) for S in transforms]
     valid = np.stack([np.arange(width) < len(S) for S in transforms])
+    turning = [axes_of(models.get(obj_id)) for obj_id in sorted(meshes)]
+    most = max(len(axes) for axes, _ in turning)
+    axes = np.stack([np.concatenate([own, np.zeros((most - len(own), 3))]) for own, _ in turning])
     return ObjectPoints(
         torch.from_numpy(np.stack(points).astype(np.float32)),
         torch.from_numpy(np.stack(padded).astype(np.float32)),
         torch.from_numpy(valid),
+        torch.from_numpy(axes.astype(np.float32)),
+        torch.from_numpy(np.stack([point for _, point in turning]).astype(np.float32)),
     )
+
+
+def axes_of(model: ModelInfo | None) -> tuple[Float[np.ndarray, "a 3"], Float[np.ndarray, "3"]]:
+    """Unit axes about which any turn leaves an object as it is, and a point (metres) on all of them; object frame.
+
+    None, one, or the three of a ball.
+    """
+    if model is None or not model.symmetries_continuous:
+        return np.zeros((0, 3)), np.zeros(3)
+    continuous = model.symmetries_continuous
+    if is_ball(continuous):
+        return np.eye(3), ball_center_m(continuous)
+    axis = np.array(continuous[0].axis)
+    return axis[None] / np.linalg.norm(axis), np.array(continuous[0].offset_m)
 
 
 def farthest_points(vertices_m: np.ndarray, n: int) -> np.ndarray:
