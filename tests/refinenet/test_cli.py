@@ -29,6 +29,7 @@ def test_train_command(cli, dataset, tmp_path):
     result = cli("train", dataset, "--out", out, *SMALL)
     assert result.exit_code == 0, result.output
     assert "start  refined" in result.stdout
+    assert "of step 2: last.safetensors, and best.safetensors too" in result.stdout
     assert str(out / "best.safetensors") in result.stdout
     again = cli("train", dataset, "--out", out, *SMALL)
     assert again.exit_code == 2
@@ -63,6 +64,7 @@ def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
         (["--preset", "paper", "--set", "network.widths=[8, 8]"], 2, "it needs network.kind=compact, plus or flow"),
         (["--preset", "flow", "--set", "network.hidden=8"], 2, "it needs network.kind=compact or plus"),
         (["--set", "optimiser.name=adam", "--set", "optimiser.weight_decay=1"], 2, "it needs optimiser.name=adamw"),
+        (["--set", "augment.occlusion_leaves=0.2"], 2, "it needs augment.occlusion=0.3 or so"),
         (["--set", "own_predictions={updates: 2}"], 2, "own_predictions.updates changes nothing here"),
         (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),

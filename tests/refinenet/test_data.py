@@ -10,8 +10,9 @@ from posecore.errors import ConfigError, ShardError
 from posecore.shard import ShardReader
 from refinenet import geometry
 from refinenet.config import load_config
-from refinenet.data import PairSource, PairStream, make_loader
+from refinenet.data import PairSource, PairStream
 from refinenet.held_out import validation_batches
+from refinenet.loader import make_loader
 from refinenet.split import divide, held_out_scenes, read_scenes, spread_rows
 
 SMALL = [

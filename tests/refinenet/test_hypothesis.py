@@ -64,6 +64,15 @@ def test_recut_without_a_turn_is_the_cut_itself():
     np.testing.assert_array_equal(warp(cut(image, whole, 128), affine, 64), cut(image, part, 64))
 
 
+def test_colours_at_the_edge_of_a_stored_patch_stay_as_they_are():
+    """Faded into black, they would show where the stored window ends, which was centred near the truth."""
+    turn = np.array([[0.9, 0.2, -3.0], [-0.2, 0.9, 9.0]])
+    scene = warp(np.full((64, 64, 3), 200, np.uint8), turn, 64)
+    assert (scene == 200).all()
+    labels = warp(np.ones((64, 64), np.uint8), turn, 64, nearest=True)
+    assert 0 < (labels == 0).sum() < 2000
+
+
 @pytest.mark.parametrize("in_plane", [False, True])
 def test_turned_and_recut_scenes_show_the_object_at_its_new_truth(mesh, rasteriser, samples, in_plane):
     """The stored silhouette, turned and cut anew, is the silhouette rendered at the new pose with the new camera."""

@@ -17,8 +17,9 @@ from posecore.files import write_atomic
 from posecore.shard import ShardReader
 from refinenet import checkpoint
 from refinenet.config import load_config
-from refinenet.data import PairStream, make_loader
+from refinenet.data import PairStream
 from refinenet.growth import Growth
+from refinenet.loader import make_loader
 from refinenet.split import DataRecord, divide, drawn_out, read_scenes
 from refinenet.train import train
 from refinenet.trainer import Trainer

@@ -1,9 +1,11 @@
 import json
+import shutil
 
 import numpy as np
 import pytest
 import torch
-from posecore.errors import CheckpointError, ConfigError, StorageError
+from posecore.errors import CheckpointError, ConfigError, DatasetError, StorageError
+from posecore.shard import MANIFEST
 from refinenet import checkpoint
 from refinenet.config import load_config
 from refinenet.errors import TrainingError
@@ -179,3 +181,49 @@ def test_the_paper_preset_takes_a_step(mesh, tmp_path):
         torch.equal(value, loaded.network().state_dict()[key]) for key, value in trainer.kept.state_dict().items()
     )
     trainer.close()
+
+
+def test_an_unfinished_dataset_is_said_to_be_one(dataset, tmp_path, caplog):
+    part = tmp_path / "part"
+    shutil.copytree(dataset, part)
+    lines = (part / MANIFEST).read_text().splitlines(keepends=True)
+    (part / MANIFEST).write_text("".join(lines[:-2]))
+    out = tmp_path / "run"
+    train(small("steps=2"), str(part), out)
+    assert f"{part}: {len(lines) - 2} of {len(lines)} shards are there, and only these are trained on" in caplog.text
+    (part / MANIFEST).write_text("".join(lines))
+    with pytest.raises(CheckpointError, match="holds now, which may have got more shards; start a new run"):
+        train(small("steps=4"), str(part), out, resume=True)
+
+
+def test_weights_whose_outputs_mean_something_else_are_refused(run, dataset, tmp_path):
+    """Heads for both kinds of translation have the same shape."""
+    init = f"init={run[0] / 'best.safetensors'}"
+    with pytest.raises(CheckpointError, match=r"are 6d and crop, this run's are 6d and camera; .*translation=crop"):
+        train(small(init, "network.translation=camera"), str(dataset), tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{}\n", "[1]\n", '{"step": "x"}\n', "\udcff\n"])
+def test_a_damaged_log_of_metrics_is_cut_off_where_it_is_damaged(tmp_path, text):
+    good = '{"step": 1, "loss": 2.0}\n'
+    (tmp_path / "metrics.jsonl").write_bytes((good + text + good).encode("utf-8", "surrogateescape"))
+    with MetricLog(tmp_path, 5):
+        pass
+    assert (tmp_path / "metrics.jsonl").read_text() == good
+
+
+def test_an_optimiser_state_that_lacks_something_is_named(run, dataset, tmp_path):
+    out = tmp_path / "run"
+    shutil.copytree(run[0], out)
+    (state,) = out.glob("optimiser-*.pt")
+    torch.save({"optimiser": {}}, state)
+    with pytest.raises(CheckpointError, match=rf"{state.name}: holds no best_mm, so the run cannot be resumed"):
+        train(small(), str(dataset), out, resume=True)
+
+
+def test_a_damaged_file_of_symmetries_is_named_where_it_is(dataset, tmp_path):
+    copy = tmp_path / "data"
+    shutil.copytree(dataset, copy)
+    (copy / "models" / "models_info.json").write_text("{")
+    with pytest.raises(DatasetError, match=f"^{copy}/models/models_info.json"):
+        train(small(), str(copy), tmp_path / "run")

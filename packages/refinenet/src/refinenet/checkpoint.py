@@ -22,10 +22,13 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor, nn
 
 from refinenet import __version__
-from refinenet.config import TrainConfig
+from refinenet.config import NetworkConfig, TrainConfig
+from refinenet.heads import forms
 from refinenet.network import make_network
 
 FORMAT, VERSION = "refinenet", "1"
+STATE = ("optimiser", "best_mm", "world")
+"""What every optimiser state holds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,11 +71,15 @@ class Checkpoint:
     path: Path
     sha256: str
 
-    def give_weights(self, network: nn.Module) -> None:
+    def give_weights(self, network: nn.Module, config: NetworkConfig) -> None:
         """Load these weights into another run's network.
 
+        Args:
+            network: Gets them.
+            config: Its own.
+
         Raises:
-            CheckpointError: It has other layers.
+            CheckpointError: It has other layers, or its outputs mean something else.
         """
         try:
             network.load_state_dict(self.tensors)
@@ -82,6 +89,12 @@ class Checkpoint:
                 f"{self.path}: weights of another network ({detail}); begin with a checkpoint of preset "
                 f"{self.provenance.config.preset} trained with the same `network` settings as this run"
             ) from error
+        mine, wanted = forms(self.provenance.config.network), forms(config)
+        if mine != wanted:  # heads of both kinds of translation have the same shape
+            raise CheckpointError(
+                f"{self.path}: its outputs are {' and '.join(mine)}, this run's are {' and '.join(wanted)}; train with "
+                f"--set network.rotation={mine[0]} --set network.translation={mine[1]}"
+            )
 
     def network(self) -> nn.Module:
         """The network with these weights, in evaluation mode.
@@ -169,7 +182,7 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
     """
     path = _state_path(folder, step)
     try:
-        return dict(torch.load(path, map_location="cpu", weights_only=True))
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"
@@ -178,6 +191,9 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"
         ) from error
+    if missing := [key for key in STATE if key not in state]:
+        raise CheckpointError(f"{path}: holds no {missing[0]}, so the run cannot be resumed; start a new one")
+    return state
 
 
 def drop_leftovers(folder: Path, keep: int) -> None:

@@ -463,6 +463,7 @@ def _require_used(config: TrainConfig, keys: Sequence[str]) -> None:
         "hypothesis.fresh=true": (config.hypothesis.fresh, ["hypothesis.any_twin", "hypothesis.in_plane"]),
         "network.confidence=true": (config.network.confidence, ["loss.confidence_"]),
         "own_predictions.share=0.5 or so": (config.own_predictions.share, ["own_predictions."]),
+        "augment.occlusion=0.3 or so": (config.augment.occlusion, ["augment.occlusion_leaves"]),
         "loader.workers=1 or more": (config.loader.workers, ["loader.prefetch"]),
     }
     choices = {

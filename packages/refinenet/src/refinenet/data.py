@@ -5,22 +5,18 @@ run resumes in the middle of an epoch by arithmetic, and a pair's pose does not 
 """
 
 import itertools
-import multiprocessing.util
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from posecore.errors import ConfigError, PoseError, ShardError
-from posecore.processes import interrupts_ignored
+from posecore.errors import ConfigError, ShardError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, load_meshes
 from torch import Tensor
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from torch.utils.data import IterableDataset, get_worker_info
 
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.growth import Growth
@@ -298,67 +294,3 @@ class PairStream(IterableDataset[Batch]):
             else pool[np.random.default_rng([self.config.seed, STAND_IN, *key]).integers(len(pool))]
             for key in group
         ]
-
-
-def prepare_worker(threads: int = 1) -> None:
-    """Keep a loader process to its own core: the software rasteriser, OpenCV and torch each start threads for all."""
-    os.environ["LP_NUM_THREADS"] = str(threads)
-    cv2.setNumThreads(threads)
-    torch.set_num_threads(threads)
-
-
-def _init_worker(_: int) -> None:
-    prepare_worker()
-    # a thread that still hands over a batch when Python ends would abort the process, and the run with a traceback
-    multiprocessing.util.Finalize(None, os._exit, args=(0,), exitpriority=-100)
-
-
-class _Loader(DataLoader[Batch]):
-    """A loader whose processes' errors arrive as they were raised, not wrapped with a traceback into the message."""
-
-    def __iter__(self) -> Any:
-        try:
-            with interrupts_ignored():
-                batches = super().__iter__()
-            yield from batches
-        except PoseError as error:
-            *wrapped, last = str(error).strip().splitlines()
-            raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None
-
-
-def make_loader(stream: PairStream, *, pin: bool = False) -> DataLoader[Batch]:
-    """A loader of the stream's batches; processes are spawned, since a GL context does not survive a fork.
-
-    Args:
-        stream: What to load.
-        pin: Put batches into page-locked memory, from where a GPU copies them while it computes.
-    """
-    loader = stream.config.loader
-    if loader.workers == 0:
-        return _Loader(stream, batch_size=None, pin_memory=pin)
-    return _Loader(
-        stream,
-        batch_size=None,
-        pin_memory=pin,
-        num_workers=stream.workers,
-        prefetch_factor=loader.prefetch,
-        multiprocessing_context="spawn",
-        worker_init_fn=_init_worker,
-    )
-
-
-def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]:
-    """Batches on a device; to a GPU they are copied beside the step before, which is still being computed."""
-    if device.type != "cuda":
-        yield from (batch.to(device) for batch in batches)
-        return
-    side = torch.cuda.Stream(device)
-    for batch in batches:
-        with torch.cuda.stream(side):
-            there = batch.to(device)
-        main = torch.cuda.current_stream(device)
-        main.wait_stream(side)
-        for tensor in (*there.pair, *there.target):
-            if tensor is not None:
-                tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
-        yield there

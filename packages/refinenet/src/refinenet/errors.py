@@ -7,5 +7,9 @@ class TrainingError(PoseError, ArithmeticError):
     """Training cannot go on: the loss or the gradient is not finite."""
 
 
+class LoaderError(PoseError, RuntimeError):
+    """Batches cannot be loaded: a process was killed, or there is too little shared memory."""
+
+
 class RefinementError(PoseError, RuntimeError):
     """Poses cannot be refined: the image is none, or this machine's memory is too small for one of them."""

@@ -116,12 +116,15 @@ class MetricLog:
     def _lines(self) -> list[dict[str, Any]]:
         if not self._path.is_file():
             return []
-        lines = []
-        for text in self._path.read_text().splitlines():
+        lines: list[dict[str, Any]] = []
+        for text in self._path.read_text(errors="replace").splitlines():
             try:
-                lines.append(json.loads(text))
+                line = json.loads(text)
             except ValueError:  # the line a killed run was writing
                 break
+            if not isinstance(line, dict) or not isinstance(line.get("step"), int):
+                break
+            lines.append(line)
         return lines
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

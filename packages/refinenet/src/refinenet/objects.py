@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
+from posecore.errors import DatasetError
 from posecore.mesh import Mesh
 from posecore.shard import ShardReader
 from posecore.simplify import simplified
@@ -36,7 +37,10 @@ def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "models_info.json"
         copy.write_bytes(reader.file("models/models_info.json"))
-        return load_models_info(copy)
+        try:
+            return load_models_info(copy)
+        except DatasetError as error:
+            raise DatasetError(str(error).replace(folder, f"{reader.url}/models")) from error
 
 
 def symmetries_of(

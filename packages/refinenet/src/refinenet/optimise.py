@@ -15,12 +15,12 @@ from refinenet.errors import TrainingError
 
 
 def learning_rate(step: int, steps: int, config: OptimiserConfig) -> float:
-    """Rate of step `step` (from 0) of `steps`: linear warm-up, then constant or a cosine down to a hundredth."""
+    """Rate of step `step` (from 0) of `steps`: linear warm-up, then constant or a cosine that ends at a hundredth."""
     if step < config.warmup_steps:
         return config.lr * (step + 1) / config.warmup_steps
     if config.schedule == "constant":
         return config.lr
-    progress = (step - config.warmup_steps) / max(1, steps - config.warmup_steps)
+    progress = (step - config.warmup_steps) / max(1, steps - 1 - config.warmup_steps)
     return config.lr * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, progress))))
 
 

@@ -66,7 +66,7 @@ def _similarity(scale: float, dx: float, dy: float) -> Float[Array, "3 3"]:
 
 
 def warp(image: Array, affine: Float[Array, "2 3"], patch_px: int, nearest: bool = False) -> Array:
-    """Resample an image by a continuous-pixel affine map; zero outside.
+    """Resample an image by a continuous-pixel affine map; outside, labels are zero and colours those of the edge.
 
     Colours are blurred first where the map shrinks them, by as much as `posecore.window.cut` blurs with "area".
     """
@@ -76,4 +76,6 @@ def warp(image: Array, affine: Float[Array, "2 3"], patch_px: int, nearest: bool
     centred = affine.copy()
     centred[:, 2] += 0.5 * affine[:, :2].sum(axis=1) - 0.5  # cv2 counts pixel centres as integers
     flags = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-    return np.asarray(cv2.warpAffine(image, centred, (patch_px, patch_px), flags=flags))
+    # colours of the outermost half pixel must not fade into black: it would show where the stored window ends
+    border = cv2.BORDER_CONSTANT if nearest else cv2.BORDER_REPLICATE
+    return np.asarray(cv2.warpAffine(image, centred, (patch_px, patch_px), flags=flags, borderMode=border))

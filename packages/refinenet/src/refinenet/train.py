@@ -12,6 +12,7 @@ from posecore.errors import CheckpointError, ConfigError
 from posecore.files import write_atomic
 
 from refinenet.config import TrainConfig
+from refinenet.loader import deaths_named
 from refinenet.metrics import MetricLog
 from refinenet.trainer import Trainer, process_group
 
@@ -44,6 +45,7 @@ def train(
         CheckpointError: There is nothing to resume, or it is of another run.
         ShardError: The dataset is damaged, of another schema, or empty.
         TrainingError: The loss is not finite.
+        LoaderError: A loader process died, or shared memory is too small for its batches.
     """
     if not resume and (out / "last.safetensors").exists():
         raise ConfigError(f"{out}: holds a run already; go on with --resume, or choose another --out")
@@ -52,7 +54,8 @@ def train(
     with process_group(config):
         run = Trainer(config, url, out, resume=resume)
         try:
-            errors = _loop(run, config, out, report)
+            with deaths_named():
+                errors = _loop(run, config, out, report)
         finally:
             run.close()
     if run.skipped:

@@ -14,17 +14,18 @@ from typing import Any
 import torch
 from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import mesh_digest
-from posecore.shard import ShardReader, load_meshes
+from posecore.shard import ShardReader, load_meshes, n_shards
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from refinenet import backbone, checkpoint, metrics
 from refinenet.config import TrainConfig
-from refinenet.data import Batch, PairStream, make_loader, on_device
+from refinenet.data import Batch, PairStream
 from refinenet.device import choose_device
 from refinenet.geometry import PoseUpdate
 from refinenet.growth import Growth, wait_for_dataset, wait_for_start
 from refinenet.held_out import HeldOut
+from refinenet.loader import make_loader, on_device
 from refinenet.loss import PIXEL_LOSSES, make_loss
 from refinenet.network import Pair, PaperNet, make_network
 from refinenet.objects import load_models, object_ids, object_points
@@ -138,7 +139,7 @@ class Trainer:
             stem = config.network.backbone
             backbone.load_pretrained(self.network.stem, stem.name, stem.weights)
         if last is None and config.init:
-            checkpoint.load(Path(config.init)).give_weights(self.network)
+            checkpoint.load(Path(config.init)).give_weights(self.network, config.network)
         decay = config.optimiser.ema_decay
         self._average = RunningAverage(self.network, decay) if decay else None
         if last is not None and state is not None:
@@ -178,6 +179,11 @@ class Trainer:
             begun = record.shards if record is not None else reader.committed
             scene_of, bad = read_scenes(reader, begun, skip=settings.skip_bad_shards, objects=self.config.objects)
             self._tell_skipped(*bad.values())
+            if not (settings.follow or reader.complete):
+                log.warning(
+                    "%s: %d of %d shards are there, and only these are trained on; --follow takes those that come",
+                    reader.url, len(reader.committed), n_shards(reader.card),
+                )  # fmt: skip
             if record is None:
                 held = held_out_scenes(
                     reader.url, scene_of, validation.scene_share, self.config.seed, growing=settings.follow
@@ -198,7 +204,10 @@ class Trainer:
 
     def _resume(self, last: checkpoint.Checkpoint, state: dict[str, Any]) -> None:
         if last.provenance.dataset_sha256 != self._dataset_sha256:
-            raise CheckpointError(f"{last.path}: was trained on other data than {self._url}; start a new run")
+            raise CheckpointError(
+                f"{last.path}: was trained on other data than {self._url} holds now, which may have got more shards; "
+                "start a new run, with --follow where shards are still being added"
+            )
         if state["world"] != self.world:
             raise ConfigError(
                 f"{last.path}: was trained by {state['world']} processes and now there are {self.world}; resume with "

@@ -11,8 +11,8 @@ from posecore.processes import behave_as_worker, in_order, spawned
 
 from refinenet import checkpoint as checkpoints
 from refinenet.checkpoint import Checkpoint
-from refinenet.data import prepare_worker
 from refinenet.estimates import ImageStarts, Results, load_frame
+from refinenet.loader import prepare_worker
 from refinenet.methods import NETWORK, PoseRefiner, make_baseline
 from refinenet.pool import PooledRefiner, PoolScorer
 from refinenet.refine import Refiner

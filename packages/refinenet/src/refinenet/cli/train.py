@@ -103,7 +103,7 @@ def train(
     with stoppable(folder), _quiet_threads(), _training_bar(config.steps, quiet) as report:
         errors = run(config, shards, folder, resume=resume, report=report)
     if errors:  # under torchrun, rank 0 has them
-        for line in _comparison(errors):
+        for line in (*_comparison(errors), *_which(folder, config.steps)):
             click.echo(line)
         click.echo(f"{folder / 'best.safetensors'}")
 
@@ -118,6 +118,21 @@ def _comparison(errors: dict[str, float]) -> Iterator[str]:
     for label, key, unit in rows:
         before, after = errors[f"validation/{key}_before_{unit}"], errors[f"validation/{key}_after_{unit}"]
         yield f"{label + ', ' + unit:<26}{before:10.2f}{after:9.2f}"
+
+
+def _which(folder: Path, steps: int) -> Iterator[str]:
+    """Of which of a run's two checkpoints the table is."""
+    from refinenet import checkpoint
+
+    best = checkpoint.load(folder / "best.safetensors").provenance.step
+    if best == steps:
+        yield f"of step {steps}: last.safetensors, and best.safetensors too"
+        return
+    yield f"of step {steps}: last.safetensors"
+    measured = (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
+    key = "validation/add_after_mm"
+    add_mm = [line[key] for line in measured if line["step"] == best and key in line]
+    yield f"best.safetensors is of step {best}" + "".join(f", points (ADD) {value:.2f} mm" for value in add_mm[-1:])
 
 
 @contextmanager
