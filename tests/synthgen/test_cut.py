@@ -21,6 +21,7 @@ from synthgen.config import CutConfig, PerturbationConfig
 from synthgen.cutter import cut_pairs
 from synthgen.dataset import model_files
 from synthgen.inspect.info import dataset_info, info_text
+from synthgen.merge import merged_card, open_parts, write_merged
 from synthgen.verify.page import report_page
 from synthgen.verify.run import verify
 
@@ -319,6 +320,25 @@ def test_pairs_of_one_image_are_one_scene(images, tmp_path):
     index = samples(tmp_path / "shards")["scene_index"]
     assert index.tolist() == [image.scene_index for image in planned.images for _ in image.pairs]
     assert sorted(set(index.tolist())) == [0, 1, 2]
+
+
+def test_two_cuts_of_the_same_images_are_merged_into_the_same_scenes(images, tmp_path):
+    """With numbers of its own an image could be trained on and held out."""
+    for seed in (0, 1):
+        cut_to(tmp_path / f"cut{seed}", images, CutConfig(seed=seed, **SMALL))
+    parts = open_parts([str(tmp_path / f"cut{seed}") for seed in (0, 1)])
+    write_merged(parts, ShardWriter.create(str(tmp_path / "both"), merged_card(parts)))
+    reader = ShardReader(str(tmp_path / "both"))
+    rows = [reader.read(i, ["scene_index", "T_cam_obj"]) for i in reader.committed]
+    scenes_of: dict[bytes, set[int]] = {}
+    for one in rows:
+        for T, scene in zip(one["T_cam_obj"], one["scene_index"], strict=True):
+            scenes_of.setdefault(T.tobytes(), set()).add(int(scene))
+    assert len(scenes_of) > 3
+    assert all(len(scenes) == 1 for scenes in scenes_of.values())
+    cut_to(tmp_path / "blocks", images, CutConfig(images_per_scene=2, **SMALL))
+    with pytest.raises(ShardError, match=r"blocks: images_per_scene is 2, expected 0 as in .*cut0"):
+        open_parts([str(tmp_path / "cut0"), str(tmp_path / "blocks")])
 
 
 def test_an_interrupted_run_ends_with_the_same_bytes(images, tmp_path):

@@ -101,3 +101,16 @@ def test_what_does_not_fit_together_is_one_line(parts, config_of, tug, bobbin_pl
     alone = CliRunner().invoke(main, ["merge", parts[0], "--out", str(tmp_path / "x")])
     assert alone.exit_code == 2
     assert "give two datasets or more" in alone.output
+
+
+def test_scenes_that_may_be_the_same_keep_one_number(parts, config_of, tug, tmp_path):
+    """Training holds out whole scenes: with two numbers one could be on both sides."""
+    write_dataset(tmp_path / "more", config_of("hypotheses_per_scene=4"), {1: tug}, 16)
+    opened = open_parts([parts[0], str(tmp_path / "more"), parts[1]])
+    write_merged(opened, ShardWriter.create(str(tmp_path / "all"), merged_card(opened)))
+    scenes = rows(str(tmp_path / "all"))["scene_index"].tolist()
+    assert scenes == [0, 0, 1, 1, 2, 2, 3, 3, 4, 4, *np.repeat(range(4), 4), 5, 5, 6, 6, 7, 7]
+    with pytest.raises(
+        ShardError, match=r"more: shows scenes that .*all, which is merged, may show too; merge the parts"
+    ):
+        open_parts([str(tmp_path / "all"), str(tmp_path / "more")])

@@ -22,9 +22,11 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
     """Datasets that can be merged.
 
     Raises:
-        ShardError: One is incomplete, is given twice, or differs from the first in what all samples must share.
+        ShardError: One is incomplete, is given twice, or differs from the first in what all samples must share; or two
+            show the same scenes and number them otherwise.
     """
     parts = [complete_dataset(url) for url in urls]
+    _require_one_numbering(parts)
     first = parts[0]
     digests: dict[str, str] = {}
     objects: dict[int, tuple[str, str, str]] = {}
@@ -50,6 +52,45 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
                     "object's, or make all datasets from the same one"
                 )
     return parts
+
+
+def _source(card: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What the scenes of a dataset are, as far as its card tells: equal ones may be the same, and are numbered alike."""
+    if "source" in card:
+        return "cut", card["source"]["dataset"], card["source"]["split"]
+    return "rendered", card["seed"], *sorted(entry["sha256"] for entry in card["objects"].values())
+
+
+def _require_one_numbering(parts: Sequence[ShardReader]) -> None:
+    """Refuse parts of which some scenes would count as two: training holds out whole scenes."""
+    blocks: dict[tuple[Any, ...], tuple[int, str]] = {}
+    inside: dict[tuple[Any, ...], str] = {}
+    for part in parts:
+        if "merged" in part.card:
+            for below in _sources_below(part.card):
+                inside.setdefault(below, part.url)
+            continue
+        size = int(part.card["cut"].get("images_per_scene", 0)) if "cut" in part.card else 0
+        first, url = blocks.setdefault(_source(part.card), (size, part.url))
+        if first != size:
+            raise ShardError(
+                f"{part.url}: images_per_scene is {size}, expected {first} as in {url}, which was cut out of images of "
+                "the same name: else training would not hold out whole scenes"
+            )
+    for source, (_, url) in blocks.items():
+        if source in inside:
+            raise ShardError(
+                f"{url}: shows scenes that {inside[source]}, which is merged, may show too; merge the parts of that "
+                "one in its place"
+            )
+
+
+def _sources_below(card: Mapping[str, Any]) -> set[tuple[Any, ...]]:
+    """Of what a merged dataset was merged of."""
+    found: set[tuple[Any, ...]] = set()
+    for part in card["merged"]:
+        found |= _sources_below(part["card"]) if "merged" in part["card"] else {_source(part["card"])}
+    return found
 
 
 def merged_card(parts: Sequence[ShardReader]) -> dict[str, Any]:
@@ -86,6 +127,8 @@ def write_merged(
 ) -> None:
     """Write the pairs of all parts, one part after the other; scenes are numbered on, so that none is two.
 
+    Parts whose scenes may be the same, as two that were cut out of the same images, share their numbers.
+
     Shards that are there are left as they are.
 
     Args:
@@ -119,10 +162,13 @@ class _Rows:
     def __init__(self, parts: Sequence[ShardReader]) -> None:
         self._parts = parts
         self._first = np.cumsum([0, *(part.n for part in parts)]).tolist()
-        self._scenes: list[int] = [0]
-        for part in parts:
+        sources = [(number,) if "merged" in part.card else _source(part.card) for number, part in enumerate(parts)]
+        scenes: dict[tuple[Any, ...], int] = {}
+        for part, source in zip(parts, sources, strict=True):
             last = max(int(part.read(i, ["scene_index"])["scene_index"].max()) for i in part.committed)
-            self._scenes.append(self._scenes[-1] + last + 1)
+            scenes[source] = max(scenes.get(source, 0), last + 1)
+        first = dict(zip(scenes, np.cumsum([0, *scenes.values()]).tolist(), strict=False))
+        self._scenes = [first[source] for source in sources]
         self._last: tuple[tuple[int, int], dict[str, Array]] | None = None
 
     def between(self, start: int, end: int) -> dict[str, Array]:
