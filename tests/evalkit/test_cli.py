@@ -181,7 +181,7 @@ def test_empty_working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     result = run("report")
     assert result.exit_code == 2
-    assert "no result file (*.csv with *.csv.json beside it) here or in results/" in result.stderr
+    assert "no result file (*.csv with *.csv.json beside it that names a dataset) here or in" in result.stderr
 
 
 def test_broken_inputs_are_one_line(work):
@@ -244,3 +244,21 @@ def test_starts_are_not_written_over_a_folder(work):
     result = run("perturb", "--dataset", "test_bop", "--out", "results", "--angles", "5")
     assert result.exit_code == 2
     assert "is a directory" in result.stderr
+
+
+def test_a_report_says_which_run_was_stopped_and_what_it_leaves_out(work, caplog):
+    """Poses that were never tried are missing like those that failed; and a tracked video belongs to no dataset."""
+    dataset = BopDataset("test_bop")
+    poses = refined_from(read_results("results/start.csv"), dataset, 0.25)
+    write_results("results/half.csv", poses[:3], {"dataset": "test_bop", "method": "half", "not_reached": 3})
+    elsewhere = [replace(poses[0], scene_id=0, im_id=77)]
+    write_results("results/video.csv", elsewhere, {"method": "edge-icp, tracking"})
+    result = run("report")
+    assert result.exit_code == 0, result.output
+    assert [file["name"] for file in json.loads((work / "report/summary.json").read_text())["files"]] == [
+        "start", "half", "quick",
+    ]  # fmt: skip
+    assert (
+        "half.csv: its run was stopped early; 3 poses or frames were not reached, and count as missing" in caplog.text
+    )
+    assert "video.csv: left out, its sidecar names no dataset" in caplog.text

@@ -1,5 +1,6 @@
 """Stores behind URLs: a whole dataset on a local S3 server, and one clear line for everything that S3 refuses."""
 
+import os
 import sys
 import urllib.request
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ import s3fs
 from moto.server import ThreadedMotoServer
 from posecore import shard
 from posecore.errors import ConfigError, ShardError, StorageError
+from posecore.files import require_writable, write_atomic
 from posecore.store import open_store
 
 CARD = {"n": 6, "shard_size": 4, "patch_px": 8, "contour_points": 3, "depth_step_m": 1e-4, "seed": 3}
@@ -152,3 +154,20 @@ def test_memory_and_local_stores_list_the_same(tmp_path: Path) -> None:
         store.set("top", b"")
         assert store.get("a/b/c") == b"xyz" and store.list_names() == ["a", "top"]
         assert store.sizes("a") == {"a/b/c": 3}
+
+
+def test_a_device_or_a_pipe_is_not_replaced_and_a_link_stays(tmp_path):
+    pipe, link, target = tmp_path / "pipe", tmp_path / "link", tmp_path / "far" / "file"
+    os.mkfifo(pipe)
+    for write in (lambda: write_atomic(pipe, b"x"), lambda: require_writable(pipe)):
+        with pytest.raises(StorageError, match="pipe: is a device or a pipe, expected a file or a free name"):
+            write()
+    assert pipe.is_fifo()
+    with pytest.raises(StorageError, match="a folder stands where a file is needed"):
+        require_writable(tmp_path)
+    link.symlink_to(target)
+    require_writable(link)
+    for data in (b"one", b"two"):
+        write_atomic(link, data)
+        assert link.is_symlink()
+        assert target.read_bytes() == data

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from posecore import se3
 from posecore.camera import project
-from posecore.errors import DatasetError
+from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import load_mesh
 from posecore.raster import DirectionalLight, Rasteriser, Shading
 from refinenet.baselines.outcome import refined
@@ -162,3 +162,32 @@ def test_signed_distance_of_a_half_plane_vanishes_on_its_edge():
     mask[:, :12] = True
     phi, _ = signed_distance_px(mask)
     np.testing.assert_allclose(phi, np.broadcast_to(12 - (np.arange(20) + 0.5), (20, 20)))
+
+
+@pytest.mark.parametrize("name", sorted(BASELINES))
+def test_what_is_no_pose_fails_with_the_reason(name, mesh, frame):
+    image, truths = frame
+    depth_m = np.full(image.shape[:2], truths[0][2, 3], np.float32)
+    mirrored, scaled, micro, behind, lost = (truths[0].copy() for _ in range(5))
+    mirrored[:, 0] *= -1
+    scaled[:3, :3] *= 2
+    micro[:3, 3] *= 1000
+    behind[2, 3] *= -1
+    lost[0, 0] = np.nan
+    reasons = {
+        "its rotation is none: scaled, mirrored or sheared": [mirrored, scaled],
+        "were millimetres taken for metres?": [micro],
+        "it is behind the camera or reaches it": [behind],
+        "its pose is not finite": [lost],
+    }
+    method = make_baseline(name, {1: mesh}, 2)
+    for why, poses in reasons.items():
+        for pose in poses:
+            (found,) = method.refine_batch(
+                Frame(image=image, K=K, depth_m=depth_m), [Request(obj_id=1, T_cam_obj=pose)]
+            )
+            assert found.failed
+            assert why in found.failure
+    with pytest.raises(ConfigError, match="object 7 has no mesh here, there are those of 1"):
+        method.refine_batch(Frame(image=image, K=K, depth_m=depth_m), [Request(obj_id=7, T_cam_obj=truths[0])])
+    method.close()

@@ -8,7 +8,7 @@ import torch
 import trimesh
 from posecore import se3
 from posecore.camera import project
-from posecore.errors import CameraError, CheckpointError
+from posecore.errors import CameraError, CheckpointError, ConfigError
 from posecore.mesh import Mesh, load_mesh, mesh_digest, save_ply
 from posecore.window import Window, cut, cut_rgb, diameter_window
 from refinenet import checkpoint, geometry
@@ -337,3 +337,18 @@ def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tm
     painted = replace(mesh, vertex_rgb=255 - mesh.vertex_rgb, sha256="f" * 64)
     with pytest.raises(CheckpointError, match="object 1 is another mesh than in training"):
         Refiner.load(tmp_path / "run" / "best.safetensors", {1: painted})
+
+
+def test_the_trained_file_read_in_another_unit_is_refused(repository, tug_ply):
+    """Its hash is the same."""
+    shipped = repository / "examples" / "checkpoints" / "tug_compact.safetensors"
+    with pytest.raises(CheckpointError, match=r"of 118\.9 mm in training, this one has 1189\..* ten times too"):
+        Refiner.load(shipped, {1: load_mesh(tug_ply, units="cm")})
+    with pytest.raises(ConfigError, match="device: found 'gpu', expected auto, cpu or cuda"):
+        Refiner.load(shipped, {1: load_mesh(tug_ply)}, device="gpu")
+
+
+def test_confidences_of_an_object_without_a_mesh(trained, mesh, frame):
+    image, truths = frame
+    with Refiner.load(trained, {1: mesh}) as refiner, pytest.raises(ConfigError, match="object 7 has no mesh here"):
+        refiner.confidences(Frame(image=image, K=K), [Request(obj_id=7, T_cam_obj=truths[0])])

@@ -1,5 +1,7 @@
 """`refinenet refine`: BOP in, BOP out."""
 
+import json
+import re
 import threading
 
 import cv2
@@ -178,3 +180,50 @@ def test_a_method_and_its_checkpoint_belong_together(cli, bop, tmp_path):
     result = cli("refine", "--dataset", root, "--init", start, "--out", tmp_path / "x.csv")
     assert result.exit_code == 2
     assert "--method network needs a --checkpoint" in result.stderr
+
+
+def test_an_overlay_that_cannot_be_is_said_before_any_work(cli, bop, tmp_path):
+    root, start = bop
+    out = tmp_path / "o.csv"
+    out.write_text("from before")
+    options = ["--method", "edge-icp", "--dataset", root, "--init", start, "--out", out, "--quiet"]
+    result = cli("refine", *options, "--overlay", start)
+    assert (result.exit_code, out.read_text()) == (1, "from before"), result.output
+    assert "a file stands where a folder is needed" in result.stderr
+
+
+def test_an_image_needs_a_camera_and_no_ground_truth(cli, two_images, tmp_path):
+    root, start, _ = two_images
+    (file,) = root.glob("test/*/scene_gt.json")
+    known = json.loads(file.read_text())
+    del known["1"]
+    file.write_text(json.dumps(known))
+    options = ["--method", "edge-icp", "--dataset", root, "--init", start, "--keep-failed", "--quiet"]
+    result = cli("refine", *options, "--out", tmp_path / "x.csv")
+    assert result.exit_code == 0, result.output
+    assert len(read_results(tmp_path / "x.csv")) == len(read_results(start))
+
+
+def test_a_camera_of_another_size_is_named_with_its_image(cli, two_images, tmp_path):
+    root, start, image = two_images
+    picture = cv2.imread(str(image))
+    cv2.imwrite(str(image), cv2.resize(picture, None, fx=0.5, fy=0.5))
+    options = ["--method", "edge-icp", "--dataset", root, "--init", start, "--out", tmp_path / "x.csv", "--quiet"]
+    result = cli("refine", *options)
+    assert result.exit_code == 1
+    assert re.search(r"two/test/000001.*: image 1: camera matrix: .* scale K with the image", result.stderr)
+
+
+def test_results_do_not_lie_on_the_sidecars_of_others(cli, bop, tmp_path):
+    root, start = bop
+    options = ["--method", "search", "--dataset", root, "--init", start, "--quiet"]
+    for outputs, text in (
+        (["--out", f"{start}.json"], "--out and the sidecar of --init are both"),
+        (
+            ["--out", tmp_path / "w.csv", "--candidates", tmp_path / "w.csv.json"],
+            "--candidates and the sidecar of --out",
+        ),
+        (["--out", tmp_path / "w.csv", "--object", 1, "--object", 9], "no pose of object 9; change --object"),
+    ):
+        result = cli("refine", *options, *outputs)
+        assert (result.exit_code, text in result.stderr) == (2, True), result.output

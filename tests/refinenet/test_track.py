@@ -326,6 +326,46 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     assert "needs a --checkpoint" in cli("track", root, *init, "--out", tmp_path / "x.csv").stderr
     edges = ["--method", "edge-icp", "--allow-other-mesh", "--out", tmp_path / "x.csv"]
     assert "--allow-other-mesh does nothing for --method edge-icp" in cli("track", root, *init, *edges).stderr
+    (tmp_path / "none.json").write_text("[]")
+    shutil.copy(root / "pose.json", tmp_path / "x.json")
+    for arguments, text in (
+        (["--method", "edge-icp", *init, "--sure", 0.9], "--sure does nothing for --method edge-icp, which tells no"),
+        (["--method", "edge-icp", *init, "--depth-step", 0.1], "--depth-step does nothing for --method edge-icp"),
+        (["--method", "edge-icp", *init, "--object", 1, "--object", 9], "no pose of object 9 for scene 1"),
+        (["--method", "edge-icp", "--pose", tmp_path / "none.json"], "none.json: no pose; list where the objects are"),
+        (["--method", "edge-icp", "--pose", tmp_path / "x.json"], "the sidecar of --out and --pose are both"),
+    ):
+        result = cli("track", root, *arguments, "--out", tmp_path / "x", "--quiet")
+        assert (result.exit_code, text in result.stderr) == (2, True), result.output
+    assert json.loads((tmp_path / "x.json").read_text()) == json.loads((root / "pose.json").read_text())
+
+
+def test_search_is_asked_for_what_is_found(cli, scene, tmp_path, monkeypatch):
+    asked = []
+
+    def refine(self, frame, T_cam_obj, target):
+        asked.append(self._min_confidence)
+        return Refinement(T_cam_obj=T_cam_obj, status=Status.STOPPED, iterations=1, confidence=0.2)
+
+    monkeypatch.setattr(GradientSearch, "_refine", refine)
+    root, _ = scene
+    out = tmp_path / "track.csv"
+    options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--sure", 0.2]
+    assert cli("track", root, *options, "--found", 0.1).exit_code == 0
+    assert set(asked) == {0.1}
+    assert read_sidecar(out)["states"]["tracking"] == FRAMES
+
+
+def test_a_run_that_stops_early_says_how_much_it_did_not_reach(cli, scene, still, tmp_path):
+    root, _ = scene
+    copy = tmp_path / "copy"
+    shutil.copytree(root, copy)
+    images = sorted((copy / "test" / "000001" / "rgb").iterdir())
+    images[3].write_bytes(b"damaged")
+    out = tmp_path / "track.csv"
+    result = cli("track", copy, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--quiet")
+    assert result.exit_code == 1
+    assert read_sidecar(out)["not_reached"] == FRAMES - 3
 
 
 def test_depth_for_a_method_that_needs_it(cli, scene, mesh, tmp_path):

@@ -39,6 +39,7 @@ def pose(seed, z=0.7):
         ([0.9, 0.1, 0.1, 0.1, 0.1], [T, U, U, L, L]),
         ([0.1, 0.1, 0.5, 0.1, 0.1, 0.1], [U, U, U, U, U, L]),  # a believed pose starts the count anew
         ([0.0, 0.0, 0.0, 0.5, 0.6], [U, U, L, L, T]),  # only one that fits brings a lost track back
+        ([0.9, None, None, None, 0.9], [T, U, U, L, T]),  # refinement failed
     ],
 )
 def test_states(confidences, states):
@@ -199,3 +200,12 @@ def test_a_depth_is_left_only_for_one_that_is_clearly_better():
             1, [Refinement(T_cam_obj=T, status=Status.CONVERGED, iterations=1, confidence=c) for T, c in results]
         )
         assert tracked.T_cam_obj[2, 3] == pytest.approx(z)
+
+
+def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
+    track = Track(obj_id=1, config=TrackingConfig(sure=0.0, found=0.0, patience=2, depth_step=0.0))
+    for frame, (status, state) in enumerate([(Status.STOPPED, T), (Status.FAILED, U), (Status.FAILED, L)]):
+        track.wanted(frame, [pose(0)])
+        found = Refinement(T_cam_obj=pose(0), status=status, iterations=1, confidence=0.0, failure="gone")
+        told = track.take(frame, [found])
+        assert (told.state, told.T_cam_obj is None) == (state, status is Status.FAILED)

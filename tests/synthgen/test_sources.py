@@ -118,3 +118,14 @@ def test_a_broken_panorama_is_one_line(tug_ply, tmp_path):
     assert "broken.hdr: does not decode as an HDRI" in result.stderr
     assert "Traceback" not in result.output
     assert not (tmp_path / "out").exists()
+
+
+def test_a_mesh_alone_has_the_symmetries_that_are_listed_beside_it(tug_ply, bobbin_ply, tmp_path):
+    sources = Sources(objects=(tug_ply, bobbin_ply))
+    assert {i: info.is_symmetric for i, info in sources.infos(sources.meshes()).items()} == {1: False, 2: True}
+    listed = json.loads((bobbin_ply.parent / "models_info.json").read_text())
+    (tmp_path / "models_info.json").write_text(json.dumps({"1": listed["bobbin"]}))
+    for name, known in (("obj_000001.ply", True), ("part.ply", False)):  # whose number is not the listed one's
+        shutil.copy(bobbin_ply, tmp_path / name)
+        alone = Sources(objects=(tmp_path / name,))
+        assert bool(alone.infos(alone.meshes())) is known

@@ -1,5 +1,6 @@
 """Which result files belong to a report, what their sidecars say, and which dataset they speak of."""
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,6 +10,8 @@ from typing import Any
 from posecore.bop import BopDataset, Estimate, read_results, read_sidecar, sidecar_path
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
+
+log = logging.getLogger(__name__)
 
 START_METHOD = "start"
 
@@ -38,16 +41,23 @@ class ResultFile:
 
 
 def find_result_files(folder: Path) -> list[Path]:
-    """Result files with a sidecar in a folder and in its `results/`.
+    """Result files with a sidecar that names a dataset, in a folder and in its `results/`; others are told.
 
     Raises:
         ConfigError: there are none.
     """
     found = [path for place in (folder, folder / "results") for path in sorted(place.glob("*.csv"))]
-    with_sidecar = [path for path in found if sidecar_path(path).is_file()]
+    with_sidecar = []
+    for path in found:
+        if sidecar_path(path).is_file():
+            if (read_sidecar(path) or {}).get("dataset"):
+                with_sidecar.append(path)
+            else:
+                log.warning("%s: left out, its sidecar names no dataset", path)
     if not with_sidecar:
         raise ConfigError(
-            f"{folder.resolve()}: no result file (*.csv with *.csv.json beside it) here or in results/; "
+            f"{folder.resolve()}: no result file (*.csv with *.csv.json beside it that names a dataset) here or in "
+            "results/; "
             "name them with --results FILE.csv --dataset DIR"
         )
     return with_sidecar
@@ -97,6 +107,13 @@ def load_result_files(paths: Sequence[Path], dataset: BopDataset) -> list[Result
         )
         for path, name in zip(paths, _unique_names(paths), strict=True)
     ]
+    for file in files:
+        if left := file.sidecar.get("not_reached"):
+            log.warning(
+                "%s: its run was stopped early; %s poses or frames were not reached, and count as missing",
+                file.path,
+                left,
+            )
     return sorted(_share_levels(files), key=lambda file: not file.is_start)
 
 

@@ -15,7 +15,7 @@ def write_atomic(path: str | Path, data: bytes) -> None:
     Raises:
         StorageError: No rights, no space, or the folder is missing.
     """
-    file = Path(path)
+    file = _target(path)
     temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -36,7 +36,7 @@ def require_writable(path: str | Path) -> None:
     Raises:
         StorageError: No rights, no space, or no such folder can be.
     """
-    file = Path(path)
+    file = _target(path)
     trial = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -44,6 +44,21 @@ def require_writable(path: str | Path) -> None:
         trial.unlink()
     except OSError as error:
         raise storage_error(file, error) from error
+
+
+def _target(path: str | Path) -> Path:
+    """The file itself where a link stands for it: the link stays.
+
+    Raises:
+        StorageError: A device or a pipe, which writing in one go would replace by a file, or a folder.
+    """
+    file = Path(path)
+    file = file.resolve() if file.is_symlink() else file
+    if file.is_dir():
+        raise StorageError(f"{path}: a folder stands where a file is needed; choose another path")
+    if file.exists() and not file.is_file():
+        raise StorageError(f"{path}: is a device or a pipe, expected a file or a free name; choose another path")
+    return file
 
 
 def storage_error(path: str | Path, error: OSError, size_bytes: int | None = None) -> StorageError:

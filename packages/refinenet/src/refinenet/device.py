@@ -10,8 +10,11 @@ def choose_device(name: str) -> torch.device:
     """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
 
     Raises:
-        ConfigError: A GPU is asked for and there is none, or fewer than local ranks.
+        ConfigError: It is none of `auto`, `cpu` and `cuda`; a GPU is asked for and there is none, or fewer than local
+            ranks.
     """
+    if name not in ("auto", "cpu", "cuda"):
+        raise ConfigError(f"device: found {name!r}, expected auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
         raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from posecore.bop import BopDataset, Estimate
 from posecore.bop.images import write_image
-from posecore.errors import DatasetError
+from posecore.errors import CameraError, DatasetError
 
 from refinenet import __version__
 from refinenet.checkpoint import Checkpoint
@@ -185,7 +185,10 @@ def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefin
             "choose a method that works on colour"
         )
     image = dataset.rgb(scene_id, im_id)
-    return Frame(image=image, K=dataset.camera(scene_id, im_id).K, depth_m=depth_m)
+    try:
+        return Frame(image=image, K=dataset.camera(scene_id, im_id).K, depth_m=depth_m)
+    except CameraError as error:
+        raise CameraError(f"{dataset.scene_path(scene_id)}: image {im_id}: {error}") from error
 
 
 def make_sidecar(

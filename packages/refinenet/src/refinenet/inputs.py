@@ -13,7 +13,8 @@ MEMBER_SIZES = (0.8, 1.25)
 def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:
     """Refuse a mesh that the checkpoint was not trained with; for a category, one of another size than its members.
 
-    The hash decides: that of the file, or `mesh_digest`. A checkpoint that has no `mesh_digest` cannot tell a mesh
+    First the size, as the same file may be read in another unit; then the hash decides, that of the file, or
+    `mesh_digest`. A checkpoint that has no `mesh_digest` cannot tell a mesh
     that was written anew from another one of its size; such a mesh passes.
 
     Raises:
@@ -30,8 +31,6 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
             "choose another checkpoint, or name the objects to refine with --object"
         )
     trained = objects[str(obj_id)]
-    if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
-        return
     trained_m = float(trained["diameter_m"])
     ratio = mesh.diameter_m / trained_m
     if abs(ratio - 1) > DIAMETER_TOLERANCE:
@@ -42,6 +41,8 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
             f"{loaded.path}: object {obj_id} had a diameter of {1e3 * trained_m:.1f} mm in training, this one has "
             f"{1e3 * mesh.diameter_m:.6g} mm: {why}"
         )
+    if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
+        return
     if "mesh_digest" in trained and mesh_digest(mesh) != trained["mesh_digest"] and not allow_other_mesh:
         raise CheckpointError(
             f"{loaded.path}: object {obj_id} is another mesh than in training ({mesh.path or 'this one'} has digest "

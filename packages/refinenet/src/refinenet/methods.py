@@ -11,8 +11,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore import se3
 from posecore.camera import Camera
-from posecore.errors import CameraError
+from posecore.errors import CameraError, ConfigError
 from posecore.mesh import Mesh
 
 from refinenet.errors import RefinementError
@@ -21,6 +22,15 @@ Array = np.ndarray
 CENTRE_TOLERANCE = 0.2
 """A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
 that of an image of another size."""
+
+SUSPICIOUS_M = 0.01
+"""A pose nearer than this was divided by a thousand once too often."""
+NEAREST_DIAMETERS = 0.6
+"""An object whose centre is nearer than so many diameters reaches the camera."""
+FARTHEST_DIAMETERS = 500.0
+"""A pose further away is in another unit: the object would be about a pixel wide."""
+ROTATION_TOLERANCE = 0.02
+"""Of a rotation's orthonormality; result files are written with few digits."""
 
 NETWORK = "network"
 BASELINES: dict[str, str] = {
@@ -117,6 +127,33 @@ class Refinement:
     def failed(self) -> bool:
         """Whether there is no refined pose."""
         return self.status is Status.FAILED
+
+
+def unseeable(T_cam_obj: Float[Array, "4 4"], mesh: Mesh) -> str | None:
+    """Why an object cannot even be drawn at a pose (metres), whatever the image; None where it can."""
+    if not np.isfinite(T_cam_obj).all():
+        return "its pose is not finite"
+    if not se3.is_rotation(T_cam_obj[:3, :3], ROTATION_TOLERANCE):
+        return "its rotation is none: scaled, mirrored or sheared"
+    z_m = float(T_cam_obj[2, :3] @ mesh.center_m + T_cam_obj[2, 3])
+    if z_m < NEAREST_DIAMETERS * mesh.diameter_m:
+        unit = "; were metres taken for millimetres?" if 0 < z_m < SUSPICIOUS_M else ""
+        return f"at z = {z_m:.3g} m it is behind the camera or reaches it{unit}"
+    if z_m > FARTHEST_DIAMETERS * mesh.diameter_m:
+        return f"it is {z_m:.6g} m away with a diameter of {mesh.diameter_m:.3g} m; were millimetres taken for metres?"
+    return None
+
+
+def require_meshes(requests: Sequence[Request], meshes: Mapping[int, Mesh]) -> None:
+    """Refuse objects that a method was not made for.
+
+    Raises:
+        ConfigError: There is one; those that it knows are named.
+    """
+    for request in requests:
+        if request.obj_id not in meshes:
+            known = ", ".join(map(str, sorted(meshes)))
+            raise ConfigError(f"object {request.obj_id} has no mesh here, there are those of {known}")
 
 
 @runtime_checkable

@@ -21,7 +21,7 @@ from refinenet.device import choose_device
 from refinenet.errors import RefinementError
 from refinenet.geometry import PoseUpdate
 from refinenet.inputs import require_trained
-from refinenet.methods import Frame, Refinement, Request, Status
+from refinenet.methods import Frame, Refinement, Request, Status, require_meshes
 from refinenet.network import Pair
 from refinenet.views import Viewer, Views
 
@@ -164,10 +164,7 @@ class Refiner:
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses in one image, of any objects, all of them together; see `refine` for errors."""
-        for request in requests:
-            if request.obj_id not in self.meshes:
-                known = ", ".join(map(str, sorted(self.meshes)))
-                raise ConfigError(f"object {request.obj_id} has no mesh here, there are those of {known}")
+        require_meshes(requests, self.meshes)
         b = len(requests)
         batch = _Batch(
             T=_poses(requests), obj_id=_objects(requests), converged=np.zeros(b, bool),
@@ -210,6 +207,7 @@ class Refiner:
         Raises:
             CheckpointError: `learned` was asked for and the network has no such output.
         """
+        require_meshes(requests, self.meshes)
         return self._judge(frame, _poses(requests), _objects(requests), scorer)[0]
 
     def _update(self, frame: Frame, batch: _Batch, rows: Int[Array, " a"]) -> None:

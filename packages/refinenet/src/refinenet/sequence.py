@@ -217,7 +217,10 @@ class FileCamera:
                 f"{name}: found {found[0]} x {found[1]} px, expected {self.size_px[0]} x {self.size_px[1]} px as "
                 f"{self.file} says; give the camera of these images"
             )
-        return Frame(image=image, K=self.K)
+        try:
+            return Frame(image=image, K=self.K)
+        except CameraError as error:
+            raise CameraError(f"{name}, with {self.file}: {error}") from error
 
 
 def read_camera(file: Path) -> FileCamera:

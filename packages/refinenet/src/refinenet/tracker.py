@@ -98,7 +98,7 @@ class Track:
         best = self._best(results)
         found, confidence = results[best], _confidence(results[best])
         gap = self.standing.missed > 0 or self.standing.state is TrackState.LOST
-        self.standing = next_standing(self.standing, confidence, self.config)
+        self.standing = next_standing(self.standing, None if found.failed else confidence, self.config)
         if self.standing.state is TrackState.LOST or self.standing.missed:
             return self._without(found.failure or f"the best pose has a confidence of {confidence:.2f}", confidence)
         pose = found.T_cam_obj

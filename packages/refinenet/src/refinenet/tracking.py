@@ -67,17 +67,17 @@ class Standing:
     missed: int = 0
 
 
-def next_standing(standing: Standing, confidence: float, config: TrackingConfig) -> Standing:
-    """State after a frame whose best pose has this confidence (0 where refinement failed).
+def next_standing(standing: Standing, confidence: float | None, config: TrackingConfig) -> Standing:
+    """State after a frame whose best pose has this confidence, None where refinement failed.
 
     A pose that fits makes any track one that tracks. One that is only believed leaves a lost track lost: it takes a
     pose that fits to start again.
     """
-    if confidence >= config.sure:
+    if confidence is not None and confidence >= config.sure:
         return Standing()
     if standing.state is TrackState.LOST:
         return standing
-    if confidence >= config.found:
+    if confidence is not None and confidence >= config.found:
         return Standing(state=TrackState.UNCERTAIN)
     missed = standing.missed + 1
     return Standing(state=TrackState.LOST if missed >= config.patience else TrackState.UNCERTAIN, missed=missed)

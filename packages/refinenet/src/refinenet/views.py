@@ -5,24 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from posecore import se3
 from posecore.camera import crop_K, project
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.window import Window, cut_rgb, diameter_window, fixed_window
 
 from refinenet.checkpoint import Provenance
-from refinenet.methods import Frame
+from refinenet.methods import Frame, unseeable
 
 Array = np.ndarray
-SUSPICIOUS_M = 0.01
-"""A pose nearer than this was divided by a thousand once too often."""
-NEAREST_DIAMETERS = 0.6
-"""An object whose centre is nearer than so many diameters reaches the camera."""
-FARTHEST_DIAMETERS = 500.0
-"""A pose further away is in another unit: the object would be about a pixel wide."""
-ROTATION_TOLERANCE = 0.02
-"""Of a rotation's orthonormality; result files are written with few digits."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,7 +74,7 @@ class Viewer:
         """Views of poses in a frame; a pose without a pixel of the object inside the image has none."""
         p, b = self._patch_px, len(T_cam_obj)
         height_px, width_px = frame.image.shape[:2]
-        failures = [self._unseeable(frame.K, T, int(i)) for T, i in zip(T_cam_obj, obj_id, strict=True)]
+        failures = [unseeable(T, self._meshes[int(i)]) for T, i in zip(T_cam_obj, obj_id, strict=True)]
         windows = {
             row: self._window(frame.K, T_cam_obj[row], int(obj_id[row])) for row in range(b) if failures[row] is None
         }
@@ -113,23 +104,6 @@ class Viewer:
             depth_m=depth_m[seen],
             inside=inside[seen],
         )
-
-    def _unseeable(self, K: Float[Array, "3 3"], T: Float[Array, "4 4"], obj_id: int) -> str | None:
-        """Why a pose cannot even be drawn, or None."""
-        if not np.isfinite(T).all():
-            return "its pose is not finite"
-        if not se3.is_rotation(T[:3, :3], ROTATION_TOLERANCE):
-            return "its rotation is none: scaled, mirrored or sheared"
-        mesh = self._meshes[obj_id]
-        z_m = float(T[2, :3] @ mesh.center_m + T[2, 3])
-        if z_m < NEAREST_DIAMETERS * mesh.diameter_m:
-            unit = "; were metres taken for millimetres?" if 0 < z_m < SUSPICIOUS_M else ""
-            return f"at z = {z_m:.3g} m it is behind the camera or reaches it{unit}"
-        if z_m > FARTHEST_DIAMETERS * mesh.diameter_m:
-            return (
-                f"it is {z_m:.6g} m away with a diameter of {mesh.diameter_m:.3g} m; were millimetres taken for metres?"
-            )
-        return None
 
     def _window(self, K: Float[Array, "3 3"], T: Float[Array, "4 4"], obj_id: int) -> Window:
         mesh, provenance = self._meshes[obj_id], self._provenance

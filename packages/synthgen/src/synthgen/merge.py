@@ -55,7 +55,7 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
 
 
 def _source(card: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What the scenes of a dataset are, as far as its card tells: equal ones may be the same, and are numbered alike."""
+    """What the scenes of a dataset are, as far as its card tells: equal ones may be the same."""
     if "source" in card:
         return "cut", card["source"]["dataset"], card["source"]["split"]
     return "rendered", card["seed"], *sorted(entry["sha256"] for entry in card["objects"].values())

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from posecore.bop import ModelInfo
 from posecore.bop.jsonfile import read_json
+from posecore.bop.models_info import load_model_info
 from posecore.errors import ConfigError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
 
@@ -33,7 +34,7 @@ class Sources:
         backgrounds: Folder of photographs.
         hdris: Folder of panoramas.
         occluders: Folder of meshes, or one mesh.
-        models_info: BOP file to take symmetries from; without it those of folders among `objects`.
+        models_info: BOP file to take symmetries from; without it those in or beside `objects`.
         allow_missing_textures: Whether a mesh whose texture is missing has its plain colours instead.
         skip_bad_objects: Whether an object that cannot be loaded is left out.
     """
@@ -98,11 +99,28 @@ class Sources:
         if self.models_info is not None:
             return load_symmetries(str(self.models_info), meshes)
         known: dict[int, ModelInfo] = {}
-        for folder in self.objects:
-            if (folder / MODELS_INFO).is_file():
-                inside = {i: m for i, m in meshes.items() if Path(m.path).parent == folder}
-                known |= load_symmetries(str(folder / MODELS_INFO), inside) if inside else {}
+        for given in self.objects:
+            inside = {i: m for i, m in meshes.items() if given in (Path(m.path), Path(m.path).parent)}
+            if given.is_dir() and inside and (given / MODELS_INFO).is_file():
+                known |= load_symmetries(str(given / MODELS_INFO), inside)
+            elif not given.is_dir():
+                known |= {i: info for i in inside if (info := info_beside(given)) is not None}
         return known
+
+
+def info_beside(mesh_file: Path) -> ModelInfo | None:
+    """What the `models_info.json` beside a mesh says of it, by its name, or by the number in a BOP name.
+
+    Raises:
+        DatasetError: It is broken.
+    """
+    file = mesh_file.with_name(MODELS_INFO)
+    if not file.is_file():
+        return None
+    numbered = re.fullmatch(r"obj_(\d+)", mesh_file.stem)
+    names = (mesh_file.stem, str(int(numbered[1])) if numbered else "")
+    listed = read_json(file)
+    return next((load_model_info(listed[name], f"{file}, object {name}") for name in names if name in listed), None)
 
 
 def find_meshes(given: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:

@@ -96,9 +96,9 @@ class BopDataset:
         self._require(scene_id)
         return self._source.annotation(scene_id, kind)
 
-    def annotated_by(self, scene_id: int) -> str:
+    def annotated_by(self, scene_id: int, of: Kind = "gt") -> str:
         """What decides which images a scene has, in words for an error."""
-        if self.has_gt(scene_id):
+        if of == "gt" and self.has_gt(scene_id):
             return f"ground truth in {self._source.annotation(scene_id, 'gt')}"
         return f"camera in {self._source.annotation(scene_id, 'camera')}"
 

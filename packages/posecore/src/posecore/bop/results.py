@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -59,20 +59,25 @@ class Estimate:
     line: int = 0
 
 
-def read_results(path: str | Path, dataset: BopDataset | None = None) -> list[Estimate]:
+def read_results(
+    path: str | Path, dataset: BopDataset | None = None, *, of: Literal["gt", "camera"] = "gt"
+) -> list[Estimate]:
     """Read a result file as a list; `read_result_table` gives the same as columns, which is faster.
 
     Args:
         path: CSV file; translations in millimetres.
         dataset: where given, scenes, images and objects that it does not have are errors.
+        of: which images it has, see `unknown_ids`.
 
     Raises:
         ResultFileError: as `read_result_table`.
     """
-    return estimates_of(read_result_table(path, dataset))
+    return estimates_of(read_result_table(path, dataset, of=of))
 
 
-def read_result_table(path: str | Path, dataset: BopDataset | None = None) -> ResultTable:
+def read_result_table(
+    path: str | Path, dataset: BopDataset | None = None, *, of: Literal["gt", "camera"] = "gt"
+) -> ResultTable:
     """Read a result file as columns. A file with a header and nothing else has no estimates.
 
     Blank lines, a byte order mark, CRLF, spaces around fields, no header, and a header that names the columns in
@@ -81,6 +86,7 @@ def read_result_table(path: str | Path, dataset: BopDataset | None = None) -> Re
     Args:
         path: CSV file; translations in millimetres.
         dataset: where given, scenes, images and objects that it does not have are errors.
+        of: which images it has, see `unknown_ids`.
 
     Raises:
         ResultFileError: missing or empty file, a line that breaks the format, NaN, a scaled or mirrored rotation, an
@@ -92,7 +98,7 @@ def read_result_table(path: str | Path, dataset: BopDataset | None = None) -> Re
     if metres is not None:
         raise ResultFileError(f"{file}:{metres.line}: {metres.message}")
     if dataset is not None:
-        unknown = min(unknown_ids(table, dataset), key=lambda fault: fault.line, default=None)
+        unknown = min(unknown_ids(table, dataset, of), key=lambda fault: fault.line, default=None)
         if unknown is not None:
             raise ResultFileError(f"{file}:{unknown.line}: {unknown.message}")
     return table
@@ -149,8 +155,14 @@ def metres_fault(table: ResultTable) -> LineFault | None:
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
 
 
-def unknown_ids(table: ResultTable, dataset: BopDataset) -> list[LineFault]:
-    """Lines whose scene, image or object the dataset does not have; the first of the three is named."""
+def unknown_ids(table: ResultTable, dataset: BopDataset, of: Literal["gt", "camera"] = "gt") -> list[LineFault]:
+    """Lines whose scene, image or object the dataset does not have; the first of the three is named.
+
+    Args:
+        table: Lines.
+        dataset: What they are of.
+        of: Which images count: the annotated ones where a scene has ground truth, or all that have a camera.
+    """
     faults: dict[int, LineFault] = {}
 
     def note(wrong: Bool[Array, " n"], field: str, message: Callable[[int], str]) -> None:
@@ -167,11 +179,12 @@ def unknown_ids(table: ResultTable, dataset: BopDataset) -> list[LineFault]:
     for number, scene_id in enumerate(scenes.tolist()):
         if not strange[number]:
             here = by_scene[bounds[number] : bounds[number + 1]]
-            nowhere[here] = ~np.isin(table.im_id[here], dataset.im_ids(scene_id))
+            known_ids = dataset.im_ids(scene_id) if of == "gt" else dataset.annotated_im_ids(scene_id, "camera")
+            nowhere[here] = ~np.isin(table.im_id[here], sorted(known_ids))
     note(
         nowhere,
         "im_id",
-        lambda i: f"image {table.im_id[i]} has no {dataset.annotated_by(int(table.scene_id[i]))}",
+        lambda i: f"image {table.im_id[i]} has no {dataset.annotated_by(int(table.scene_id[i]), of)}",
     )
     known = ", ".join(map(str, dataset.obj_ids))
     note(

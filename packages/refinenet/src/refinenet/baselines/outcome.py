@@ -11,7 +11,7 @@ from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 
 from refinenet.baselines.view import Target
-from refinenet.methods import Frame, Refinement, Request, Status
+from refinenet.methods import Frame, Refinement, Request, Status, require_meshes, unseeable
 
 Array = np.ndarray
 SMALL_ANGLE_RAD = np.deg2rad(0.5)
@@ -44,8 +44,18 @@ class Baseline(ABC):
         return {"iterations": self.iterations}
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
-        """Refine poses in one image."""
-        return [self._refine(frame, request.T_cam_obj, self._target(request)) for request in requests]
+        """Refine poses in one image.
+
+        Raises:
+            ConfigError: An object has no mesh here.
+        """
+        require_meshes(requests, self._meshes)
+        return [self._seen(frame, request.T_cam_obj, self._target(request)) for request in requests]
+
+    def _seen(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
+        """Refine one pose, if it can be drawn at all."""
+        why = unseeable(T_cam_obj, target.mesh)
+        return failed(T_cam_obj, 0, why) if why else self._refine(frame, T_cam_obj, target)
 
     def _target(self, request: Request) -> Target:
         return Target(obj_id=request.obj_id, mesh=self._meshes[request.obj_id], rasteriser=self._rasteriser)

@@ -127,7 +127,7 @@ class GradientSearch(Baseline):
             for i, (request, before) in enumerate(zip(requests, results, strict=True)):
                 if before.failed:
                     target = replace(self._target(request), known_m=self._known_m(frame, request, poses))
-                    again = self._refine(frame, request.T_cam_obj, target)
+                    again = self._seen(frame, request.T_cam_obj, target)
                     worse, better = sorted((again, before), key=_final_confidence)
                     done = before.iterations + again.iterations
                     results[i] = replace(better, iterations=done, tried=(*worse.tried, *better.tried))

@@ -12,6 +12,8 @@ from posecore.raster import Rasteriser
 from posecore.window import Window, cut, diameter_window
 from scipy.special import ndtri
 
+from refinenet.methods import unseeable
+
 Array = np.ndarray
 WINDOW_SCALE = 1.6
 """Window side over the projected diameter: room for a search of 0.3 diameters on each side."""
@@ -84,10 +86,9 @@ class Edges:
 def finest_px(K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh, at_most_px: int) -> int:
     """Side of the finest patch worth looking at: the image's own resolution, or `at_most_px`. 0: nothing to see.
 
-    Nothing is to be seen of a pose that is not finite, that lies at or behind the camera, or that is too far away.
+    Nothing is to be seen of a pose that is `unseeable`, or that is too far away.
     """
-    centre_m = T_cam_obj[:3, :3] @ mesh.center_m + T_cam_obj[:3, 3]
-    if not np.isfinite(T_cam_obj).all() or centre_m[2] < 0.6 * mesh.diameter_m:
+    if unseeable(T_cam_obj, mesh):
         return 0
     side_px = diameter_window(K, T_cam_obj, mesh.center_m, mesh.diameter_m, WINDOW_SCALE).side_px
     return 0 if side_px < MIN_SIDE_PX else int(np.clip(np.ceil(side_px), 48, at_most_px))

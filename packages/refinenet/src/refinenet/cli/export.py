@@ -24,9 +24,12 @@ def export(checkpoint: Path, out: Path, verbose: bool) -> None:
     refinenet export --checkpoint best.safetensors --out model.pt2
     """
     start_logging(verbose)
+    from posecore.files import require_writable
+
     from refinenet import checkpoint as checkpoints
     from refinenet import export as exports
 
+    require_writable(out)
     differences = exports.export(checkpoints.load(checkpoint), out)
     shown = ", ".join(
         f"{name} {value:.1e} (at most {exports.TOLERANCES[name]:.0e})" for name, value in differences.items()

@@ -8,6 +8,8 @@ from click.core import ParameterSource
 
 from refinenet.methods import BASELINES, NETWORK
 
+RESULT_FILES = ("--init", "--out", "--candidates")
+"""Options whose files have a sidecar."""
 FILE = click.Path(path_type=Path)
 NEW_FILE = click.Path(path_type=Path, dir_okay=False)
 method_option = click.option(
@@ -30,7 +32,10 @@ workers_option = click.option(
     help="Processes that refine images side by side; several have one torch thread each if --threads does not say.",
 )  # fmt: skip
 iterations_option = click.option(
-    "--iterations", type=click.IntRange(1), default=5, help="Most updates of a pose; fewer once one is small."
+    "--iterations",
+    type=click.IntRange(1),
+    default=5,
+    help="Most updates of a pose, fewer once one is small; without a network so many at each resolution or range.",
 )
 other_mesh_option = click.option(
     "--allow-other-mesh", is_flag=True, help="Take a mesh of the trained object's size that is not the trained one."
@@ -40,14 +45,21 @@ verbose_option = click.option("--verbose", is_flag=True, help="Log details to st
 
 
 def require_apart(read: Mapping[str, Path | None], written: Mapping[str, Path | None]) -> None:
-    """Refuse an output that is an input, or another output; both by the names of their options."""
-    known = {path.resolve(): name for name, path in read.items() if path is not None}
-    for name, path in written.items():
-        if path is None:
-            continue
-        other = known.setdefault(path.resolve(), name)
-        if other != name:
-            raise click.UsageError(f"{name} and {other} are both {path}: name two files")
+    """Refuse an output that is an input, or another output; both by the names of their options.
+
+    Result files have a sidecar beside them, which counts as well.
+    """
+    known: dict[Path, str] = {}
+    for name, path, is_new in (*((*one, False) for one in read.items()), *((*one, True) for one in written.items())):
+        for what, file in () if path is None else _with_sidecar(name, path):
+            other = known.setdefault(file.resolve(), what)
+            if other != what and is_new:
+                raise click.UsageError(f"{what} and {other} are both {file}: name two files")
+
+
+def _with_sidecar(name: str, path: Path) -> list[tuple[str, Path]]:
+    beside = [(f"the sidecar of {name}", path.with_name(f"{path.name}.json"))] if name in RESULT_FILES else []
+    return [(name, path), *beside]
 
 
 def require_used(why: str, *names: str) -> None:

@@ -136,14 +136,14 @@ def refine(
         torch.set_num_threads(threads)
     loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     bop = BopDataset(dataset, split)
-    given = read_results(init, bop)
+    given = read_results(init, bop, of="camera")
     starts = [s for s in given if not objects or s.obj_id in objects]
     if not given:
         raise ConfigError(f"{init}: no poses in it, there is nothing to refine")
-    if not starts:
-        raise ConfigError(f"{init}: no pose of object {', '.join(map(str, objects))}; change --object")
+    if missing := sorted(set(objects) - {s.obj_id for s in starts}):
+        raise ConfigError(f"{init}: no pose of object {', '.join(map(str, missing))}; change --object")
     start_sidecar = read_sidecar(init) or {}
-    for path in filter(None, (out, candidates)):
+    for path in filter(None, (out, candidates, overlay and overlay / "overlay.png")):
         require_writable(path)
     obj_ids = tuple(sorted({s.obj_id for s in starts}))
     settings = MethodSettings(

@@ -25,6 +25,7 @@ from refinenet.cli.options import (
     threads_option,
     verbose_option,
 )
+from refinenet.methods import WITH_CONFIDENCE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -120,6 +121,8 @@ def track(
     require_fit(method, checkpoint)
     if video is None:
         require_used("without --video", "fps")
+    if method not in WITH_CONFIDENCE:
+        require_used(f"for --method {method}, which tells no confidence", "sure", "found", "depth_step")
     if (init is None) == (pose is None):
         raise click.UsageError("give either --init or --pose: where the objects are at the start")
     require_apart(
@@ -150,7 +153,7 @@ def track(
     log, stopped = TrackLog(), None
     refiner: PoseRefiner
     if loaded is None:
-        refiner = make_baseline(method, meshes, iterations)
+        refiner = make_baseline(method, meshes, iterations, min_confidence=found)
     else:
         refiner = Refiner(loaded, meshes, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh)
     with closing(refiner), progress_bar(quiet) as bar:
@@ -188,6 +191,8 @@ def track(
         "resets": log.resets,
         "misses": log.misses,
     }  # fmt: skip
+    if stopped is not None:
+        sidecar["not_reached"] = max(len(sequence) - log.frames, 1)  # of a video the length is not known
     write_results(out, log.estimates, sidecar)
     counts = ", ".join(f"{count} {state}" for state, count in log.states.items())
     click.echo(f"{out}: {log.frames} frames, {counts}; {len(log.resets)} starts from a given pose")
@@ -221,11 +226,12 @@ class _Starts:
                 if not objects or obj_id in objects:
                     self._always.setdefault(obj_id, []).append(T)
         self.obj_ids = sorted({i for known in (self._always, *self._at.values()) for i in known})
-        if not self.obj_ids:
-            which = f" of object {', '.join(map(str, objects))}" if objects else ""
-            raise ConfigError(
-                f"{init or pose}: no pose{which} for scene {sequence.scene_id}; change --scene or --object"
-            )
+        missing = sorted(set(objects) - set(self.obj_ids))
+        if missing or not self.obj_ids:
+            which = f" of object {', '.join(map(str, missing))}" if missing else ""
+            where, change = (f" for scene {sequence.scene_id}", "--scene or --object") if init else ("", "--object")
+            todo = f"change {change}" if objects or init else "list where the objects are at the start"
+            raise ConfigError(f"{init or pose}: no pose{which}{where}; {todo}")
 
     def offered(self, number: int) -> "dict[int, list[np.ndarray]]":
         """Poses for a frame, by object."""
@@ -236,7 +242,7 @@ def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
     from posecore.bop.annotations import ground_truth
     from posecore.bop.jsonfile import read_json
 
-    from refinenet.views import SUSPICIOUS_M
+    from refinenet.methods import SUSPICIOUS_M
 
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
     nearest_m = min((abs(float(pose.T_cam_obj[2, 3])) for pose in poses), default=SUSPICIOUS_M)

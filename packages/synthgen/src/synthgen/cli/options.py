@@ -91,8 +91,8 @@ def scene_options(command: F) -> F:
             "--models-info",
             type=click.Path(path_type=Path),
             metavar="FILE",
-            help="BOP models_info.json to take symmetries from; its keys are object ids or mesh names. [that of a BOP "
-            "models folder]",
+            help="BOP models_info.json to take symmetries from; its keys are object ids or mesh names. [those "
+            "in or beside --object]",
         ),
         click.option(
             "--allow-missing-textures",
