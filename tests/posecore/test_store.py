@@ -165,6 +165,12 @@ def test_a_device_or_a_pipe_is_not_replaced_and_a_link_stays(tmp_path):
     assert pipe.is_fifo()
     with pytest.raises(StorageError, match="a folder stands where a file is needed"):
         require_writable(tmp_path)
+    circle = tmp_path / "circle"
+    circle.symlink_to(circle)
+    for wrong in (circle, tmp_path / ("n" * 300)):
+        for write in (lambda path=wrong: write_atomic(path, b"x"), lambda path=wrong: require_writable(path)):
+            with pytest.raises(StorageError):
+                write()
     link.symlink_to(target)
     require_writable(link)
     for data in (b"one", b"two"):

@@ -114,3 +114,9 @@ def test_scenes_that_may_be_the_same_keep_one_number(parts, config_of, tug, tmp_
         ShardError, match=r"more: shows scenes that .*all, which is merged, may show too; merge the parts"
     ):
         open_parts([str(tmp_path / "all"), str(tmp_path / "more")])
+    opened = open_parts([parts[0], parts[1]])
+    write_merged(opened, ShardWriter.create(str(tmp_path / "two"), merged_card(opened)))
+    with pytest.raises(
+        ShardError, match=r"two: may show scenes that .*all shows, and both are merged; merge the parts"
+    ):
+        open_parts([str(tmp_path / "all"), str(tmp_path / "two")])

@@ -40,17 +40,22 @@ class ResultFile:
         return self.sidecar.get("method") == START_METHOD
 
 
-def find_result_files(folder: Path) -> list[Path]:
+def find_result_files(folder: Path, is_dataset_given: bool = False) -> list[Path]:
     """Result files with a sidecar that names a dataset, in a folder and in its `results/`; others are told.
+
+    Args:
+        folder: Where.
+        is_dataset_given: whether the dataset is known otherwise; then sidecars need not name one.
 
     Raises:
         ConfigError: there are none.
+        ResultFileError: a sidecar is damaged.
     """
     found = [path for place in (folder, folder / "results") for path in sorted(place.glob("*.csv"))]
     with_sidecar = []
     for path in found:
         if sidecar_path(path).is_file():
-            if (read_sidecar(path) or {}).get("dataset"):
+            if is_dataset_given or (read_sidecar(path) or {}).get("dataset"):
                 with_sidecar.append(path)
             else:
                 log.warning("%s: left out, its sidecar names no dataset", path)

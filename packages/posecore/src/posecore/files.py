@@ -50,13 +50,20 @@ def _target(path: str | Path) -> Path:
     """The file itself where a link stands for it: the link stays.
 
     Raises:
-        StorageError: A device or a pipe, which writing in one go would replace by a file, or a folder.
+        StorageError: A device or a pipe, which writing in one go would replace by a file, a folder, or a name that
+            cannot be.
     """
     file = Path(path)
-    file = file.resolve() if file.is_symlink() else file
-    if file.is_dir():
+    try:
+        file = file.resolve() if file.is_symlink() else file
+        is_folder, is_other = file.is_dir(), file.exists() and not file.is_file()
+    except OSError as error:
+        raise storage_error(path, error) from error
+    except RuntimeError as error:  # what Python 3.11 says of links in a circle
+        raise StorageError(f"{path}: a link that leads back to itself; choose another path") from error
+    if is_folder:
         raise StorageError(f"{path}: a folder stands where a file is needed; choose another path")
-    if file.exists() and not file.is_file():
+    if is_other:
         raise StorageError(f"{path}: is a device or a pipe, expected a file or a free name; choose another path")
     return file
 

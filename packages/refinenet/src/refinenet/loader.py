@@ -3,6 +3,8 @@
 import multiprocessing.util
 import os
 import shutil
+import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,17 +40,17 @@ def require_shared_memory(batch: Batch, in_flight: int) -> None:
     """Refuse to go on where batches that wait to be used do not fit: torch would lose one, and wait for it for ever.
 
     Raises:
-        LoaderError: Too little is free; what is needed is said.
+        LoaderError: It is too small; what is needed is said.
     """
     if not SHARED_MEMORY.is_dir():
         return
     tensors = (*batch.pair, *batch.target, batch.sample_ids, batch.visible_share, batch.render_colours)
     needed = in_flight * sum(x.nbytes for x in tensors if x is not None)
-    free = shutil.disk_usage(SHARED_MEMORY).free
-    if free < needed:
+    size = shutil.disk_usage(SHARED_MEMORY).total  # what is free already lacks the batches of faster processes
+    if size < needed:
         enough_gb = max(1, round(2 * needed / 1e9))
         raise LoaderError(
-            f"{SHARED_MEMORY}: {free / 1e6:.0f} MB are free, the {in_flight} batches that loader processes may have "
+            f"{SHARED_MEMORY}: has {size / 1e6:.0f} MB, the {in_flight} batches that loader processes may have "
             f"ready need {needed / 1e6:.0f} MB; start the container with --shm-size={enough_gb}g, or lower "
             "loader.prefetch or --workers (0 needs none)"
         )
@@ -83,10 +85,17 @@ def deaths_named() -> Iterator[None]:
     except RuntimeError as error:
         if not str(error).startswith("DataLoader worker"):
             raise
-        raise LoaderError(
-            "a loader process ended, killed or out of memory; with less loader.cache_mb or fewer --workers it needs "
-            "less, and --resume goes on from the last checkpoint"
-        ) from error
+        raise _death(str(error).partition(". ")[0].rstrip(".").removeprefix("DataLoader worker ")) from error
+
+
+def _death(what: str) -> LoaderError:
+    """What to say of a process that died, after which torch's handler, which would raise again, is taken out."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    return LoaderError(
+        f"a loader process ended: {what}; where memory is short, fewer --workers or less loader.cache_mb need less, "
+        "where /dev/shm is, --shm-size makes it larger; --resume goes on from the last checkpoint, if there is one"
+    )
 
 
 class _Loader(DataLoader[Batch]):
@@ -100,6 +109,8 @@ class _Loader(DataLoader[Batch]):
         except PoseError as error:
             *wrapped, last = str(error).strip().splitlines()
             raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None
+        except (ConnectionError, EOFError) as error:  # from the pipe that a killed one leaves
+            raise _death("its pipe broke") from error
 
 
 def make_loader(stream: PairStream, *, pin: bool = False) -> DataLoader[Batch]:

@@ -51,11 +51,10 @@ def train(
         raise ConfigError(f"{out}: holds a run already; go on with --resume, or choose another --out")
     if resume and not (out / "last.safetensors").exists():
         raise CheckpointError(f"{out}: no run to resume, last.safetensors is missing; leave --resume out to start one")
-    with process_group(config):
+    with deaths_named(), process_group(config):
         run = Trainer(config, url, out, resume=resume)
         try:
-            with deaths_named():
-                errors = _loop(run, config, out, report)
+            errors = _loop(run, config, out, report)
         finally:
             run.close()
     if run.skipped:

@@ -46,10 +46,11 @@ def nearest_by_rotation(
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> Float[Tensor, "b 4 4"]:
-    """The truth's symmetric twin whose rotation is nearest to a pose's, by the mean L1 distance of turned points.
+    """The truth's symmetric twin whose rotation is nearest to a pose's.
 
-    A symmetry whose axis misses the object's origin moves that, too. The sample that is nearest is turned about the
-    object's axes the rest of the way, so an exact pose has itself as its twin.
+    A symmetry whose axis misses the object's origin moves that, too. The sample that is nearest by the mean L1 distance
+    of turned points is turned about the object's axes the rest of the way, to the least squared distance: so an exact
+    pose has itself as its twin, and the twin does not depend on which of them is called the truth.
 
     Args:
         T_cam_obj: Poses, metres.
@@ -87,7 +88,7 @@ def nearest_by_points(
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, " b"]]:
-    """The same by the mean distance of points in camera axes, translations included; and that distance, metres."""
+    """The same by points in camera axes, translations included; and their mean distance, metres."""
     points, on_axes = objects.points_m[object_index], objects.on_axes_m[object_index][:, None]
     twins = T_true[:, None] @ objects.symmetries[object_index]
     got = points @ T_cam_obj[:, :3, :3].transpose(1, 2) + T_cam_obj[:, None, :3, 3]

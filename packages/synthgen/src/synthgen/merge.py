@@ -68,14 +68,19 @@ def _require_one_numbering(parts: Sequence[ShardReader]) -> None:
     for part in parts:
         if "merged" in part.card:
             for below in _sources_below(part.card):
-                inside.setdefault(below, part.url)
+                if inside.setdefault(below, part.url) != part.url:
+                    raise ShardError(
+                        f"{part.url}: may show scenes that {inside[below]} shows, and both are merged; merge the parts "
+                        "of both in their place"
+                    )
             continue
         size = int(part.card["cut"].get("images_per_scene", 0)) if "cut" in part.card else 0
         first, url = blocks.setdefault(_source(part.card), (size, part.url))
         if first != size:
             raise ShardError(
                 f"{part.url}: images_per_scene is {size}, expected {first} as in {url}, which was cut out of images of "
-                "the same name: else training would not hold out whole scenes"
+                "the same name: else training would not hold out whole scenes; if these are other images, give their "
+                "folder another name and cut them again"
             )
     for source, (_, url) in blocks.items():
         if source in inside:

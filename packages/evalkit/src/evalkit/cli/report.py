@@ -47,7 +47,7 @@ def report(
     from evalkit.report import write_report
 
     here = Path()
-    paths = list(results) or find_result_files(here)
+    paths = list(results) or find_result_files(here, dataset is not None)
     opened = BopDataset(dataset or dataset_of(paths, here), split)
     with _progress() as progress:
 

@@ -56,7 +56,7 @@ def tables(
 
     require_suffixes(out)
     here = Path()
-    paths = list(results) or find_result_files(here)
+    paths = list(results) or find_result_files(here, dataset is not None)
     opened = BopDataset(dataset or dataset_of(paths, here), split)
     found = paper_tables(score_files(opened, paths, vss, workers=workers), by=by, resamples=resamples)
     click.echo(text_of(found, ".md"), nl=False)
