@@ -96,7 +96,7 @@ def test_a_cosine_rate_that_jumps_on_resume_is_said(dataset, tmp_path, caplog):
         resumed = Trainer(small(*options, "steps=8"), str(dataset), tmp_path, resume=True)
     assert "steps was 4 and is now 8, so the cosine rate jumps from 1e-05 to 0.000395" in caplog.text
     values = resumed.take_step(next(resumed.stream()))
-    assert values["learning_rate"] == pytest.approx(0.000505)
+    assert values["learning_rate"] == pytest.approx(0.00039485, abs=1e-8)
     resumed.close()
     caplog.clear()
     Trainer(small(*options), str(dataset), tmp_path, resume=True).close()
