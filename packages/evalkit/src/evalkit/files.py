@@ -62,8 +62,7 @@ def find_result_files(folder: Path, is_dataset_given: bool = False) -> list[Path
     if not with_sidecar:
         raise ConfigError(
             f"{folder.resolve()}: no result file (*.csv with *.csv.json beside it that names a dataset) here or in "
-            "results/; "
-            "name them with --results FILE.csv --dataset DIR"
+            "results/; name them with --results FILE.csv --dataset DIR"
         )
     return with_sidecar
 

@@ -206,6 +206,7 @@ class Refiner:
 
         Raises:
             CheckpointError: `learned` was asked for and the network has no such output.
+            ConfigError: An object has no mesh here.
         """
         require_meshes(requests, self.meshes)
         return self._judge(frame, _poses(requests), _objects(requests), scorer)[0]

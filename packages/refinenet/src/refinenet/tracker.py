@@ -114,7 +114,7 @@ class Track:
 
     def _best(self, results: Sequence[Refinement]) -> int:
         """The most confident result; of one start's three depths its own, unless another's is clearly more so."""
-        best = max(range(len(results)), key=lambda i: _confidence(results[i]))
+        best = max(range(len(results)), key=lambda i: (not results[i].failed, _confidence(results[i])))
         if best >= self._own or not self.config.depth_step:
             return best
         own = 3 * (best // 3)
