@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from posecore import se3
 from posecore.bop import BopDataset
-from refinenet.methods import Frame, Request
-from refinenet.refine import Refiner
+from refinenet.refine.network_refiner import Refiner
+from refinenet.refiner import Frame, Request
 
 DISTANCES = ((0, 0.0), (2, 0.02), (10, 0.05), (20, 0.1), (40, 0.2), (0, 1.0), (170, 0.0))
 """Degrees and diameters."""

@@ -14,9 +14,9 @@ import numpy as np
 from posecore.bop import BopDataset
 from posecore.errors import PoseError
 from posecore.raster import Rasteriser
-from refinenet.baselines.search import agreement_of
-from refinenet.baselines.view import Target
-from refinenet.methods import Frame
+from refinenet.baselines.global_search import agreement_of
+from refinenet.baselines.patch import Target
+from refinenet.refiner import Frame
 
 STRETCH = np.arange(-10, 11) * 0.005
 """Logarithms of depth over annotated depth."""

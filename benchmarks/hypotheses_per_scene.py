@@ -18,15 +18,16 @@ from pathlib import Path
 
 import numpy as np
 from posecore.shard import load_meshes
-from refinenet import checkpoint, metrics
 from refinenet.config import TrainConfig, load_config
-from refinenet.data import PairSource
+from refinenet.data.objects import load_models, object_points
+from refinenet.data.pair_stream import PairSource
+from refinenet.data.split import Split, spread_rows
+from refinenet.data.validation_set import validation_batches
 from refinenet.device import choose_device
-from refinenet.held_out import validation_batches
-from refinenet.objects import load_models, object_points
-from refinenet.split import Split, spread_rows
-from refinenet.train import train
-from refinenet.twins import ObjectPoints
+from refinenet.geometry.symmetry import ObjectPoints
+from refinenet.models import checkpoint
+from refinenet.training import validation
+from refinenet.training.loop import train
 
 PATCH_PX = 64
 TEST_PAIRS = 1024
@@ -51,7 +52,7 @@ def measure(config: TrainConfig, run: Path, test: Path) -> dict[str, float]:
     )
     network = checkpoint.load(run / "last.safetensors").network()
     device = choose_device("cpu")
-    errors = metrics.measure(network, validation_batches(source, split, config.batch), objects, device)
+    errors = validation.measure(network, validation_batches(source, split, config.batch), objects, device)
     source.close()
     return {name.removeprefix("validation/"): round(value, 3) for name, value in errors.items()}
 

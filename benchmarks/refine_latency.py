@@ -20,8 +20,8 @@ from posecore import se3
 from posecore.camera import intrinsics
 from posecore.mesh import Mesh, load_mesh
 from posecore.raster import Rasteriser
-from refinenet.methods import Frame, Request
-from refinenet.refine import Refiner
+from refinenet.refine.network_refiner import Refiner
+from refinenet.refiner import Frame, Request
 
 ROOT = Path(__file__).resolve().parent.parent
 K = intrinsics(572.4, 573.6, 325.3, 242.0)

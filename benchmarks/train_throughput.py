@@ -20,8 +20,8 @@ from pathlib import Path
 
 import torch
 from refinenet.config import PRESETS, load_config
-from refinenet.data import Batch
-from refinenet.trainer import Trainer
+from refinenet.data.pair_stream import Batch
+from refinenet.training.run import Trainer
 from torch.utils.flop_counter import FlopCounterMode
 
 PEAK_TFLOPS = {"H100": 989.0, "H200": 989.0, "A100": 312.0}

@@ -7,8 +7,9 @@ import pytest
 import torch
 from click.testing import CliRunner
 from posecore.shard import ShardReader
-from refinenet import geometry, loss
-from refinenet.geometry import PoseUpdate
+from refinenet.geometry import poses
+from refinenet.geometry.poses import PoseUpdate
+from refinenet.training import losses
 from synthgen.cli import main
 
 N = 200
@@ -27,11 +28,11 @@ def shard_arrays(tmp_path_factory, tug_ply: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def target(shard_arrays: dict[str, np.ndarray]) -> loss.Target:
+def target(shard_arrays: dict[str, np.ndarray]) -> losses.Target:
     def real(name: str) -> torch.Tensor:
         return torch.from_numpy(shard_arrays[name].astype(np.float64))
 
-    return loss.Target(
+    return losses.Target(
         T_cam_obj=real("T_cam_obj"),
         T_cam_obj_hypothesis=real("T_cam_obj_hypothesis"),
         K_crop=real("K_crop"),
@@ -43,21 +44,21 @@ def target(shard_arrays: dict[str, np.ndarray]) -> loss.Target:
     )
 
 
-def terms_px(update: PoseUpdate, target: loss.Target) -> tuple[torch.Tensor, torch.Tensor]:
+def terms_px(update: PoseUpdate, target: losses.Target) -> tuple[torch.Tensor, torch.Tensor]:
     """Both directions of the loss, (b,) each."""
-    forward = loss.forward_contour_loss_px(update, target)
-    return forward, loss.contour_loss_px(update, target) - forward
+    forward = losses.forward_contour_loss_px(update, target)
+    return forward, losses.contour_loss_px(update, target) - forward
 
 
 def no_update() -> PoseUpdate:
     return PoseUpdate(torch.eye(3, dtype=torch.float64).repeat(N, 1, 1), torch.zeros(N, 3, dtype=torch.float64))
 
 
-def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(target: loss.Target) -> None:
+def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(target: losses.Target) -> None:
     """A turned object shows another rim, so what stays grows with the angle; moved only, it is under half a pixel."""
-    true = geometry.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
+    true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     start, end = terms_px(no_update(), target), terms_px(true, target)
-    angle_deg = geometry.rotation_angle_deg(true.dR)
+    angle_deg = poses.rotation_angle_deg(true.dR)
     for before, after in zip(start, end, strict=True):
         assert float(after.median()) < 0.5
         assert float(after[angle_deg < 5].max()) < 0.8
@@ -65,26 +66,26 @@ def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(
         assert float((after / before).median()) < 0.25
 
 
-def test_the_update_turns_about_the_objects_origin(target: loss.Target) -> None:
+def test_the_update_turns_about_the_objects_origin(target: losses.Target) -> None:
     """The same rotation about the camera's centre instead carries the contour far away."""
-    true = geometry.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
+    true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     t = target.T_cam_obj_hypothesis[:, :3, 3]
     about_camera = PoseUpdate(true.dR, (true.dR @ t[..., None])[..., 0] - t + true.dt)
-    right, wrong = loss.contour_loss_px(true, target), loss.contour_loss_px(about_camera, target)
+    right, wrong = losses.contour_loss_px(true, target), losses.contour_loss_px(about_camera, target)
     assert float(wrong.median()) > 20 * float(right.median())
 
 
-def test_the_gradient_points_home(target: loss.Target) -> None:
+def test_the_gradient_points_home(target: losses.Target) -> None:
     """From the hypothesis, a small step along the negative gradient of either kind of motion brings the pose nearer.
 
     Moves: the translation's gradient lies within 90 degrees of the way home in the image plane wherever the start is
     more than two pixels off. Along the straight way home the mean loss falls at every quarter, and every
     single one ends lower.
     """
-    true = geometry.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
+    true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     dt = torch.zeros(N, 3, dtype=torch.float64, requires_grad=True)
     at_true_rotation = PoseUpdate(true.dR, dt)
-    loss.contour_loss_px(at_true_rotation, target).sum().backward()
+    losses.contour_loss_px(at_true_rotation, target).sum().backward()
     assert dt.grad is not None
     home, downhill = true.dt[:, :2], -dt.grad[:, :2]
     off_px = home.norm(dim=-1) * target.K_crop[:, 0, 0] / target.T_cam_obj[:, 2, 3]
@@ -96,7 +97,7 @@ def test_the_gradient_points_home(target: loss.Target) -> None:
     values = []
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         part = PoseUpdate(torch.linalg.matrix_exp(skew(share * rotvec)), share * true.dt)
-        values.append(loss.contour_loss_px(part, target))
+        values.append(losses.contour_loss_px(part, target))
     along = torch.stack(values)
     astray = along[0] > 2.0  # the rest starts within the contour's discretisation of home
     assert int(astray.sum()) > 100
@@ -105,7 +106,7 @@ def test_the_gradient_points_home(target: loss.Target) -> None:
 
 
 def rotation_vector(dR: torch.Tensor) -> torch.Tensor:
-    angle = torch.deg2rad(geometry.rotation_angle_deg(dR))
+    angle = torch.deg2rad(poses.rotation_angle_deg(dR))
     axis = torch.stack((dR[:, 2, 1] - dR[:, 1, 2], dR[:, 0, 2] - dR[:, 2, 0], dR[:, 1, 0] - dR[:, 0, 1]), dim=-1)
     return torch.nn.functional.normalize(axis, dim=-1) * angle[:, None]
 

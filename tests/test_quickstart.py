@@ -125,7 +125,7 @@ def test_promises_are_kept_or_missed_by_the_reports_numbers() -> None:
 @pytest.mark.parametrize(("preset", "steps"), [("compact", 16000), ("flow", 6000)])
 def test_the_shipped_checkpoints_load_and_are_of_the_example_object(repository, tug_ply, preset, steps):
     from posecore.mesh import load_mesh, mesh_digest
-    from refinenet import checkpoint
+    from refinenet.models import checkpoint
 
     loaded = checkpoint.load(repository / "examples" / "checkpoints" / f"tug_{preset}.safetensors", preset)
     loaded.network()

@@ -19,9 +19,9 @@ from posecore.mesh import Mesh, load_mesh, save_ply
 from posecore.raster import Rasteriser
 from posecore.shard import ShardWriter
 from posecore.window import cut, fixed_side_px, fixed_window
-from refinenet import checkpoint
 from refinenet.config import load_config
-from refinenet.network import make_network
+from refinenet.models import checkpoint
+from refinenet.models.networks import make_network
 
 K = intrinsics(572.4, 573.6, 325.3, 242.0)
 WIDTH_PX, HEIGHT_PX = 640, 480

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from posecore.camera import back_project
 from posecore.errors import DatasetError
 
-from refinenet.baselines.outcome import Baseline, failed, refined
-from refinenet.baselines.view import Target, View, at_nearest, finest_px, look
-from refinenet.methods import Frame, Refinement
+from refinenet.baselines.base import Baseline, failed, refined
+from refinenet.baselines.patch import Target, View, at_nearest, finest_px, look
+from refinenet.refiner import Frame, Refinement
 
 Array = np.ndarray
 REACH = (0.3, 0.15, 0.08, 0.04)

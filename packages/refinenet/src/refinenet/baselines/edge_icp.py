@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from refinenet.baselines.outcome import Baseline, failed, refined
-from refinenet.baselines.solve import moved, projection_jacobian, step, tukey_weight
-from refinenet.baselines.view import EDGE_BLUR_PX, Edges, Target, View, finest_px, inner_edges, look, silhouette_edges
-from refinenet.methods import Frame, Refinement
+from refinenet.baselines.base import Baseline, failed, refined
+from refinenet.baselines.gauss_newton import moved, projection_jacobian, step, tukey_weight
+from refinenet.baselines.patch import EDGE_BLUR_PX, Edges, Target, View, finest_px, inner_edges, look, silhouette_edges
+from refinenet.refiner import Frame, Refinement
 
 Array = np.ndarray
 LEVELS = ((0.35, 0.12), (0.6, 0.07), (1.0, 0.035))

@@ -26,8 +26,8 @@ def export(checkpoint: Path, out: Path, verbose: bool) -> None:
     start_logging(verbose)
     from posecore.files import require_writable
 
-    from refinenet import checkpoint as checkpoints
-    from refinenet import export as exports
+    from refinenet.models import checkpoint as checkpoints
+    from refinenet.models import export as exports
 
     require_writable(out)
     differences = exports.export(checkpoints.load(checkpoint), out)

@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 from click.core import ParameterSource
 
-from refinenet.methods import BASELINES, NETWORK
+from refinenet.refiner import BASELINES, NETWORK
 
 RESULT_FILES = ("--init", "--out", "--candidates")
 """Options whose files have a sidecar."""

@@ -24,10 +24,10 @@ from refinenet.cli.options import (
     verbose_option,
     workers_option,
 )
-from refinenet.methods import NETWORK, WITH_CONFIDENCE, WITH_NETWORK
+from refinenet.refiner import NETWORK, WITH_CONFIDENCE, WITH_NETWORK
 
 if TYPE_CHECKING:
-    from refinenet.pool import PoolScorer
+    from refinenet.refine.multi_hypothesis import PoolScorer
 
 SHOWN_FAILURES = 5
 
@@ -128,9 +128,17 @@ def refine(
     from posecore.bop import BopDataset, read_results, read_sidecar, write_results
     from posecore.files import require_writable
 
-    from refinenet import checkpoint as checkpoints
-    from refinenet.estimates import ImageStarts, OverlayFolder, Refined, Results, add_results, by_image, make_sidecar
-    from refinenet.workers import MethodSettings, refined_by_workers, refined_here
+    from refinenet.models import checkpoint as checkpoints
+    from refinenet.refine.bop_results import (
+        ImageStarts,
+        OverlayFolder,
+        Refined,
+        Results,
+        add_results,
+        by_image,
+        make_sidecar,
+    )
+    from refinenet.refine.workers import MethodSettings, refined_by_workers, refined_here
 
     if threads:
         torch.set_num_threads(threads)

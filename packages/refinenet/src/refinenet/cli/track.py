@@ -25,15 +25,15 @@ from refinenet.cli.options import (
     threads_option,
     verbose_option,
 )
-from refinenet.methods import WITH_CONFIDENCE
+from refinenet.refiner import WITH_CONFIDENCE
 
 if TYPE_CHECKING:
     import numpy as np
     from posecore.bop import ModelInfo
     from posecore.mesh import Mesh, Units
 
-    from refinenet.checkpoint import Checkpoint
-    from refinenet.sequence import FrameSequence
+    from refinenet.models.checkpoint import Checkpoint
+    from refinenet.tracking.frame_sources import FrameSequence
 
 SHOWN_REASONS = 3
 
@@ -134,13 +134,13 @@ def track(
     from posecore.files import require_writable
 
     from refinenet import __version__
-    from refinenet import checkpoint as checkpoints
-    from refinenet.methods import PoseRefiner, make_baseline
-    from refinenet.refine import Refiner
-    from refinenet.sequence import BopScene, open_sequence
-    from refinenet.track import TrackLog, track_sequence
-    from refinenet.tracker import Tracker, usual_config
-    from refinenet.tracking import TrackingConfig
+    from refinenet.models import checkpoint as checkpoints
+    from refinenet.refine.network_refiner import Refiner
+    from refinenet.refiner import PoseRefiner, make_baseline
+    from refinenet.tracking.frame_sources import BopScene, open_sequence
+    from refinenet.tracking.run import TrackLog, track_sequence
+    from refinenet.tracking.state import TrackingConfig
+    from refinenet.tracking.tracker import Tracker, usual_config
 
     if threads:
         torch.set_num_threads(threads)
@@ -242,7 +242,7 @@ def _read_poses(file: Path) -> "list[tuple[int, np.ndarray]]":
     from posecore.bop.annotations import ground_truth
     from posecore.bop.jsonfile import read_json
 
-    from refinenet.methods import SUSPICIOUS_M
+    from refinenet.refiner import SUSPICIOUS_M
 
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
     nearest_m = min((abs(float(pose.T_cam_obj[2, 3])) for pose in poses), default=SUSPICIOUS_M)
@@ -262,7 +262,7 @@ def _models(
     from posecore.bop.models_info import load_model_info
     from posecore.mesh import load_mesh
 
-    from refinenet.sequence import BopScene
+    from refinenet.tracking.frame_sources import BopScene
 
     if isinstance(sequence, BopScene):
         if files or units != "mm":

@@ -87,7 +87,7 @@ def train(
     """
     start_logging(verbose)
     from refinenet.config import load_config
-    from refinenet.train import train as run
+    from refinenet.training.loop import train as run
 
     named = {
         "steps": steps, "batch": batch, "loss.name": loss, "seed": seed, "loader.workers": workers, "threads": threads,
@@ -122,7 +122,7 @@ def _comparison(errors: dict[str, float]) -> Iterator[str]:
 
 def _which(folder: Path, steps: int) -> Iterator[str]:
     """Of which of a run's two checkpoints the table is."""
-    from refinenet import checkpoint
+    from refinenet.models import checkpoint
 
     best = checkpoint.load(folder / "best.safetensors").provenance.step
     if best == steps:

@@ -1,0 +1,1 @@
+"""Shards to batches: splits, pairs, loader processes, validation pairs."""

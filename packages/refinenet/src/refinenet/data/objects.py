@@ -1,0 +1,113 @@
+"""A dataset's objects: meshes for the rasteriser, points and symmetries for the point loss and the metrics."""
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
+from posecore.errors import DatasetError
+from posecore.mesh import Mesh
+from posecore.shard import ShardReader
+from posecore.simplify import simplified
+from posecore.symmetry import ball_center_m, is_ball
+
+from refinenet.geometry.symmetry import ObjectPoints
+
+
+def object_ids(reader: ShardReader) -> list[int]:
+    """Objects of the data card, sorted."""
+    return sorted(int(key) for key in reader.card["objects"])
+
+
+def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:
+    """Meshes to draw hypotheses with in training: a face for each pixel of a patch, where there are more."""
+    return {obj_id: simplified(mesh, patch_px**2) for obj_id, mesh in meshes.items()}
+
+
+def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
+    """Diameters and symmetries that the dataset carries in `models/models_info.json`.
+
+    Raises:
+        ShardError: The file is missing.
+        DatasetError: It is not valid.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "models_info.json"
+        copy.write_bytes(reader.file("models/models_info.json"))
+        try:
+            return load_models_info(copy)
+        except DatasetError as error:
+            raise DatasetError(str(error).replace(folder, f"{reader.url}/models")) from error
+
+
+def symmetries_of(
+    meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], step_deg: float
+) -> dict[int, np.ndarray]:
+    """(s, 4, 4) transforms that leave each object as it is, the identity first, by object id.
+
+    Args:
+        meshes: By object id.
+        models: Symmetries by object id; an object that is not there has none.
+        step_deg: Step at which continuous symmetries are sampled.
+    """
+    found = {}
+    for obj_id in meshes:
+        known = models.get(obj_id)
+        identity = np.eye(4)[None]
+        found[obj_id] = identity if known is None else symmetry_transforms(known, max_step_rad=np.deg2rad(step_deg))
+    return found
+
+
+def object_points(
+    meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], n_points: int, step_deg: float
+) -> ObjectPoints:
+    """Vertices spread over each object by farthest-point sampling, and its symmetries, padded to one shape.
+
+    Args:
+        meshes: By object id; rows follow the sorted ids.
+        models: Symmetries by object id; an object that is not there has none.
+        n_points: Points of each object.
+        step_deg: Step at which continuous symmetries are sampled.
+    """
+    points = [farthest_points(mesh.vertices_m, n_points) for _, mesh in sorted(meshes.items())]
+    transforms = [S for _, S in sorted(symmetries_of(meshes, models, step_deg).items())]
+    width = max(len(S) for S in transforms)
+    padded = [np.concatenate([S, np.tile(np.eye(4), (width - len(S), 1, 1))]) for S in transforms]
+    valid = np.stack([np.arange(width) < len(S) for S in transforms])
+    turning = [axes_of(models.get(obj_id)) for obj_id in sorted(meshes)]
+    most = max(len(axes) for axes, _ in turning)
+    axes = np.stack([np.concatenate([own, np.zeros((most - len(own), 3))]) for own, _ in turning])
+    return ObjectPoints(
+        torch.from_numpy(np.stack(points).astype(np.float32)),
+        torch.from_numpy(np.stack(padded).astype(np.float32)),
+        torch.from_numpy(valid),
+        torch.from_numpy(axes.astype(np.float32)),
+        torch.from_numpy(np.stack([point for _, point in turning]).astype(np.float32)),
+    )
+
+
+def axes_of(model: ModelInfo | None) -> tuple[Float[np.ndarray, "a 3"], Float[np.ndarray, "3"]]:
+    """Unit axes about which any turn leaves an object as it is, and a point (metres) on all of them; object frame.
+
+    None, one, or the three of a ball.
+    """
+    if model is None or not model.symmetries_continuous:
+        return np.zeros((0, 3)), np.zeros(3)
+    continuous = model.symmetries_continuous
+    if is_ball(continuous):
+        return np.eye(3), ball_center_m(continuous)
+    axis = np.array(continuous[0].axis)
+    return axis[None] / np.linalg.norm(axis), np.array(continuous[0].offset_m)
+
+
+def farthest_points(vertices_m: np.ndarray, n: int) -> np.ndarray:
+    """(n, 3) vertices, each the farthest from those before; repeats where the mesh has fewer."""
+    chosen = [int(np.argmax(np.linalg.norm(vertices_m - vertices_m.mean(axis=0), axis=1)))]
+    distance = np.full(len(vertices_m), np.inf)
+    for _ in range(n - 1):
+        distance = np.minimum(distance, np.linalg.norm(vertices_m - vertices_m[chosen[-1]], axis=1))
+        chosen.append(int(distance.argmax()))
+    return np.asarray(vertices_m[chosen])

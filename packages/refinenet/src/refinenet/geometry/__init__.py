@@ -1,0 +1,1 @@
+"""Pose updates in torch, with gradients, and symmetry-equivalent poses."""

@@ -1,0 +1,241 @@
+"""Checkpoints: weights with the resolved config, step, seed, versions and dataset hash in one safetensors file.
+
+The weights are the ones to refine with: the running average, where the run keeps one. The optimiser's state, and the
+weights that training goes on with, lie beside it in a file named by its step, written first: a run killed between the
+two still finds the pair that belongs together.
+"""
+
+import io
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from posecore import config as posecore_config
+from posecore.errors import CheckpointError, ConfigError
+from posecore.files import sha256_bytes, write_atomic
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor, nn
+
+from refinenet import __version__
+from refinenet.config import NetworkConfig, TrainConfig
+from refinenet.models.heads import forms
+from refinenet.models.networks import make_network
+
+FORMAT, VERSION = "refinenet", "1"
+STATE = ("optimiser", "best_mm", "world")
+"""What every optimiser state holds."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Provenance:
+    """Where weights come from.
+
+    Attributes:
+        config: Resolved config of the run.
+        step: Optimiser steps taken.
+        dataset_sha256: Hash of the training data's card and manifest.
+        objects: By object id as text: name, diameter_m, window_side_px, mesh sha256, as on the data card.
+        camera_fx_px: Focal length of the training camera, which a fixed window depends on; 0 where unknown.
+    """
+
+    config: TrainConfig
+    step: int
+    dataset_sha256: str
+    objects: dict[str, dict[str, Any]]
+    camera_fx_px: float = 0.0
+
+    def window_side_px(self, obj_id: int) -> float:
+        """Side of an object's fixed window in training, pixels; of an unseen member of a category the largest."""
+        cards = [self.objects[str(obj_id)]] if str(obj_id) in self.objects else list(self.objects.values())
+        return max(float(card["window_side_px"]) for card in cards)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Checkpoint:
+    """A checkpoint file in memory.
+
+    Attributes:
+        provenance: Where it comes from.
+        tensors: Weights by name.
+        path: File.
+        sha256: Hash of the file.
+    """
+
+    provenance: Provenance
+    tensors: dict[str, Tensor]
+    path: Path
+    sha256: str
+
+    def give_weights(self, network: nn.Module, config: NetworkConfig) -> None:
+        """Load these weights into another run's network.
+
+        Args:
+            network: Gets them.
+            config: Its own.
+
+        Raises:
+            CheckpointError: It has other layers, or its outputs mean something else.
+        """
+        try:
+            network.load_state_dict(self.tensors)
+        except RuntimeError as error:
+            detail = str(error).splitlines()[-1].strip()[:200]
+            raise CheckpointError(
+                f"{self.path}: weights of another network ({detail}); begin with a checkpoint of preset "
+                f"{self.provenance.config.preset} trained with the same `network` settings as this run"
+            ) from error
+        mine, wanted = forms(self.provenance.config.network), forms(config)
+        if mine != wanted:  # heads of both kinds of translation have the same shape
+            raise CheckpointError(
+                f"{self.path}: its outputs are {' and '.join(mine)}, this run's are {' and '.join(wanted)}; train with "
+                f"--set network.rotation={mine[0]} --set network.translation={mine[1]}"
+            )
+
+    def network(self) -> nn.Module:
+        """The network with these weights, in evaluation mode.
+
+        Raises:
+            CheckpointError: The weights do not fit the config beside them.
+        """
+        network = make_network(self.provenance.config.network)
+        try:
+            network.load_state_dict(self.tensors)
+        except RuntimeError as error:
+            detail = str(error).splitlines()[-1].strip()[:200]
+            raise CheckpointError(f"{self.path}: weights do not fit its own config: {detail}") from error
+        return network.eval()
+
+
+def save(path: Path, network: nn.Module, provenance: Provenance) -> None:
+    """Write a checkpoint atomically."""
+    metadata = {
+        "format": FORMAT,
+        "version": VERSION,
+        "config": json.dumps(posecore_config.to_dict(provenance.config)),
+        "step": str(provenance.step),
+        "seed": str(provenance.config.seed),
+        "dataset_sha256": provenance.dataset_sha256,
+        "objects": json.dumps(provenance.objects),
+        "camera_fx_px": repr(provenance.camera_fx_px),
+        "versions": json.dumps({"refinenet": __version__, "torch": torch.__version__}),
+    }
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in network.state_dict().items()}
+    write_atomic(path, save_tensors(tensors, metadata))
+
+
+def load(path: Path, preset: str | None = None) -> Checkpoint:
+    """Read a checkpoint.
+
+    Args:
+        path: File.
+        preset: If given, the preset it must be of.
+
+    Raises:
+        CheckpointError: Missing, not a checkpoint of this project, of another version, or of another preset.
+    """
+    try:
+        content = path.read_bytes()
+        with safe_open(path, "pt") as opened:
+            metadata = opened.metadata() or {}
+        tensors = load_tensors(content)
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: no such checkpoint; train one with `refinenet train`") from error
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path}: no readable safetensors file ({error}); choose another checkpoint") from error
+    found = (metadata.get("format"), metadata.get("version"))
+    if found != (FORMAT, VERSION):
+        raise CheckpointError(f"{path}: format {found[0]} version {found[1]}, expected {FORMAT} version {VERSION}")
+    try:
+        config = posecore_config.build(TrainConfig, json.loads(metadata["config"]), str(path))
+        provenance = Provenance(
+            config=config,
+            step=int(metadata["step"]),
+            dataset_sha256=metadata["dataset_sha256"],
+            objects=json.loads(metadata["objects"]),
+            camera_fx_px=float(metadata["camera_fx_px"]),
+        )
+    except (KeyError, ValueError) as error:
+        detail = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
+        raise CheckpointError(f"{path}: damaged metadata ({detail})") from error
+    if preset is not None and config.preset != preset:
+        raise CheckpointError(f"{path}: a checkpoint of preset {config.preset}, expected preset {preset}")
+    return Checkpoint(provenance=provenance, tensors=tensors, path=path, sha256=sha256_bytes(content))
+
+
+def save_state(folder: Path, step: int, state: Mapping[str, Any]) -> None:
+    """Write the optimiser's state of a step, for `load_state`."""
+    buffer = io.BytesIO()
+    torch.save(dict(state), buffer)
+    write_atomic(_state_path(folder, step), buffer.getvalue())
+
+
+def load_state(folder: Path, step: int) -> dict[str, Any]:
+    """The optimiser's state that belongs to `last.safetensors` of this step.
+
+    Raises:
+        CheckpointError: It is missing or damaged.
+    """
+    path = _state_path(folder, step)
+    try:
+        state = dict(torch.load(path, map_location="cpu", weights_only=True))
+    except FileNotFoundError as error:
+        raise CheckpointError(
+            f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"
+        ) from error
+    except Exception as error:  # torch.load raises whatever its unpickler meets
+        raise CheckpointError(
+            f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"
+        ) from error
+    if missing := [key for key in STATE if key not in state]:
+        raise CheckpointError(f"{path}: holds no {missing[0]}, so the run cannot be resumed; start a new one")
+    return state
+
+
+def drop_leftovers(folder: Path, keep: int) -> None:
+    """Remove the optimiser states of other steps, and what a killed run left under temporary names."""
+    for path in folder.glob("optimiser-*.pt"):
+        if path != _state_path(folder, keep):
+            path.unlink(missing_ok=True)
+    for name in ("*.safetensors", "optimiser-*.pt"):
+        for path in folder.glob(f".{name}.*.tmp"):
+            path.unlink(missing_ok=True)
+
+
+def _state_path(folder: Path, step: int) -> Path:
+    return folder / f"optimiser-{step:07d}.pt"
+
+
+MAY_CHANGE = (
+    "steps", "threads", "device", "compile", "log_every", "checkpoint_every", "validation.pairs", "validation.every",
+    "loader.skip_bad_shards", "loader.prefetch", "loader.cache_mb", "init", "network.backbone.weights",
+    "network.backbone.pretrained",
+)  # fmt: skip
+"""Settings that a resumed run may change: they decide how long and where it runs, or how it began.
+
+The share of scenes held out is none of them: with another one, scenes that were trained on would be measured on.
+"""
+
+
+def require_same(stored: TrainConfig, wanted: TrainConfig, where: Path) -> None:
+    """Refuse to resume a run under settings that would make it another run.
+
+    Raises:
+        ConfigError: A setting differs; the first is named with both values.
+    """
+    before, now = (dict(_leaves(posecore_config.to_dict(config))) for config in (stored, wanted))
+    for key in before:
+        if key not in MAY_CHANGE and before[key] != now[key]:
+            raise ConfigError(f"{where}: {key} was {before[key]} and is now {now[key]}; resume with the same settings")
+
+
+def _leaves(mapping: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in mapping.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value

@@ -1,0 +1,126 @@
+"""What poses look like in an image: window, render and scene patch of each, or why there is none."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+from posecore.camera import crop_K, project
+from posecore.mesh import Mesh
+from posecore.raster import Rasteriser
+from posecore.window import Window, cut_rgb, diameter_window, fixed_window
+
+from refinenet.models.checkpoint import Provenance
+from refinenet.refiner import Frame, unseeable
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Views:
+    """A batch of poses as seen in one image.
+
+    Attributes:
+        failures: (b) why a pose cannot be seen; None for those that can.
+        rows: (s,) which of the batch can be seen; the rest of the fields is about these.
+        K_crop: Cameras of the patches.
+        scene_rgb: Patches of the image, black outside of it.
+        hypothesis_rgb: Renders on black in the same windows.
+        depth_m: Their camera z, 0 beside the object.
+        inside: Patch pixels that lie in the image.
+    """
+
+    failures: list[str | None]
+    rows: Int[Array, " s"]
+    K_crop: Float[Array, "s 3 3"]
+    scene_rgb: UInt8[Array, "s p p 3"]
+    hypothesis_rgb: UInt8[Array, "s p p 3"]
+    depth_m: Float[Array, "s p p"]
+    inside: Bool[Array, "s p p"]
+
+    @property
+    def mask(self) -> Bool[Array, "s p p"]:
+        """Silhouettes of the renders."""
+        return self.depth_m > 0
+
+
+class Viewer:
+    """Looks at poses through the windows that a network was trained with, until it is closed.
+
+    Args:
+        meshes: Objects by id.
+        provenance: Of the network: patch, kind of window, the training camera.
+
+    Raises:
+        RenderError: There is no device to render on.
+    """
+
+    def __init__(self, meshes: Mapping[int, Mesh], provenance: Provenance) -> None:
+        self._meshes = dict(meshes)
+        self._provenance = provenance
+        self._patch_px = provenance.config.network.patch_px
+        self._rasteriser = Rasteriser(meshes)
+
+    def close(self) -> None:
+        """Free what the renderer holds."""
+        self._rasteriser.close()
+
+    @property
+    def renderer(self) -> str:
+        """What draws, in its own words."""
+        return self._rasteriser.device
+
+    def look(self, frame: Frame, T_cam_obj: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]) -> Views:
+        """Views of poses in a frame; a pose without a pixel of the object inside the image has none."""
+        p, b = self._patch_px, len(T_cam_obj)
+        height_px, width_px = frame.image.shape[:2]
+        failures = [unseeable(T, self._meshes[int(i)]) for T, i in zip(T_cam_obj, obj_id, strict=True)]
+        windows = {
+            row: self._window(frame.K, T_cam_obj[row], int(obj_id[row])) for row in range(b) if failures[row] is None
+        }
+        K_crop = {row: crop_K(frame.K, window, p) for row, window in windows.items()}
+        rgb, depth_m = np.zeros((b, p, p, 3), np.uint8), np.zeros((b, p, p), np.float32)
+        inside = np.zeros((b, p, p), bool)
+        drawable = np.array(sorted(windows), np.int64)
+        if len(drawable):
+            cameras = np.stack([K_crop[int(r)] for r in drawable])
+            layers = self._rasteriser.render(obj_id[drawable], cameras, T_cam_obj[drawable], p, p)
+            rgb[drawable], depth_m[drawable] = layers.rgb, layers.depth_m
+        for row, window in windows.items():
+            inside[row] = pixels_inside(window, p, width_px, height_px)
+            if not (depth_m[row] > 0).any():
+                failures[row] = f"its render at {T_cam_obj[row, 2, 3]:.3g} m covers no pixel"
+            elif not ((depth_m[row] > 0) & inside[row]).any():
+                center = self._meshes[int(obj_id[row])].center_m
+                u, v = project(frame.K, (T_cam_obj[row, :3, :3] @ center + T_cam_obj[row, :3, 3])[None])[0]
+                failures[row] = f"it lies at ({u:.0f}, {v:.0f}) px, outside of the image of {width_px} x {height_px} px"
+        seen = np.array([row for row in range(b) if failures[row] is None], np.int64)
+        return Views(
+            failures=failures,
+            rows=seen,
+            K_crop=np.array([K_crop[int(r)] for r in seen]).reshape(-1, 3, 3),
+            scene_rgb=_stacked([cut_rgb(frame.image, windows[int(r)], p) for r in seen], p),
+            hypothesis_rgb=rgb[seen],
+            depth_m=depth_m[seen],
+            inside=inside[seen],
+        )
+
+    def _window(self, K: Float[Array, "3 3"], T: Float[Array, "4 4"], obj_id: int) -> Window:
+        mesh, provenance = self._meshes[obj_id], self._provenance
+        if provenance.config.window.kind == "diameter":
+            return diameter_window(K, T, mesh.center_m, mesh.diameter_m, provenance.config.window.scale)
+        side_px = provenance.window_side_px(obj_id)
+        # The same share of the field of view as in training, so that another camera shows the object at the same size.
+        scale = float(K[0, 0]) / provenance.camera_fx_px if provenance.camera_fx_px > 0 else 1.0
+        return fixed_window(mesh.vertices_m, K, T, side_px * scale)
+
+
+def pixels_inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[Array, "p p"]:
+    """Which patch pixels lie in the image."""
+    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
+    u, v = window.x0_px + centre, window.y0_px + centre
+    return ((v >= 0) & (v < height_px))[:, None] & ((u >= 0) & (u < width_px))[None]
+
+
+def _stacked(patches: Sequence[UInt8[Array, "p p 3"]], patch_px: int) -> UInt8[Array, "s p p 3"]:
+    return np.stack(patches) if patches else np.zeros((0, patch_px, patch_px, 3), np.uint8)

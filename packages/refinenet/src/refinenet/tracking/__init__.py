@@ -1,0 +1,1 @@
+"""An object followed from frame to frame of a sequence."""

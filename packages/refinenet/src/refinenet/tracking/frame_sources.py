@@ -1,0 +1,285 @@
+"""Where tracked frames come from: a BOP scene, a folder of images, a video file."""
+
+import itertools
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from posecore.bop import BopDataset
+from posecore.bop.images import COLOUR_EXTENSIONS, read_rgb
+from posecore.camera import intrinsics
+from posecore.errors import CameraError, ConfigError, DatasetError
+
+from refinenet.refine.bop_results import load_frame
+from refinenet.refiner import Frame, PoseRefiner
+
+Array = np.ndarray
+MIN_SHARE = 0.9
+"""Of the frames that a video's file promises; containers count inexactly."""
+
+
+@runtime_checkable
+class FrameSequence(Protocol):
+    """Frames in order, numbered as a BOP result file numbers them."""
+
+    @property
+    def scene_id(self) -> int:
+        """Scene in the result file."""
+        ...
+
+    def __len__(self) -> int:
+        """How many frames there are; of a video as its file says."""
+        ...
+
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
+        """Yield image number and frame, with depth where the method needs it.
+
+        Raises:
+            DatasetError: A frame has none.
+        """
+        ...
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BopScene:
+    """A scene of a BOP dataset, its images in rising order."""
+
+    dataset: BopDataset
+    scene_id: int
+
+    def __len__(self) -> int:
+        return len(self._numbers())
+
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
+        """Yield image id and frame."""
+        for im_id in self._numbers():
+            yield im_id, load_frame(self.dataset, self.scene_id, im_id, method)
+
+    def _numbers(self) -> list[int]:
+        return sorted(self.dataset.annotated_im_ids(self.scene_id, "camera"))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ImageFolder:
+    """The images of a folder, by the numbers in their names: `f2` is before `f10`.
+
+    Names that are numbers are the frames' numbers, others are numbered from 0.
+    """
+
+    folder: Path
+    camera: "FileCamera"
+    scene_id: int = 0
+
+    def __post_init__(self) -> None:
+        files = self._files()
+        if not files:
+            kinds = ", ".join(COLOUR_EXTENSIONS)
+            raise DatasetError(f"{self.folder}: no images ({kinds}) in it; give a folder of images")
+        for one, other in itertools.pairwise(files):
+            if one.stem.isdecimal() and other.stem.isdecimal() and int(one.stem) == int(other.stem):
+                raise DatasetError(f"{self.folder}: {one.name} and {other.name} have one number; keep one of them")
+
+    def __len__(self) -> int:
+        return len(self._files())
+
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
+        """Yield number and frame."""
+        _refuse_depth(method, self.folder)
+        files = self._files()
+        are_numbers = all(file.stem.isdecimal() for file in files)
+        for index, file in enumerate(files):
+            yield int(file.stem) if are_numbers else index, self.camera.frame(read_rgb(file), str(file))
+
+    def _files(self) -> list[Path]:
+        images = (p for p in self.folder.iterdir() if p.suffix.lower().lstrip(".") in COLOUR_EXTENSIONS)
+        return sorted(images, key=_with_numbers)
+
+
+def _with_numbers(file: Path) -> tuple[list[tuple[str, int]], str]:
+    """A file name's text and numbers in turn."""
+    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", file.stem)], file.name
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VideoFile:
+    """The frames of a video file, from 0, as OpenCV decodes them."""
+
+    file: Path
+    camera: "FileCamera"
+    scene_id: int = 0
+
+    def __post_init__(self) -> None:
+        video = cv2.VideoCapture(str(self.file))
+        opened = video.isOpened()
+        video.release()
+        if not opened:
+            raise DatasetError(f"{self.file}: OpenCV cannot open it as a video; convert it, or give a folder of images")
+
+    def __len__(self) -> int:
+        video = cv2.VideoCapture(str(self.file))
+        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        video.release()
+        return max(count, 0)
+
+    def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
+        """Yield number and frame."""
+        _refuse_depth(method, self.file)
+        video = cv2.VideoCapture(str(self.file))
+        try:
+            number = 0
+            while True:
+                ok, image = video.read()
+                if not ok:
+                    break
+                yield number, self.camera.frame(_rgb(image), str(self.file))
+                number += 1
+        finally:
+            video.release()
+        if number == 0:
+            raise DatasetError(f"{self.file}: no frame can be decoded; convert it, or give a folder of images")
+        if number < MIN_SHARE * len(self):
+            raise DatasetError(
+                f"{self.file}: ends after frame {number} of {len(self)}, it is damaged or cut off; "
+                "copy or convert it anew"
+            )
+
+
+def _refuse_depth(method: PoseRefiner, source: Path) -> None:
+    if method.needs_depth:
+        raise DatasetError(f"{source}: images and videos have no depth, which {method.name} needs; give a BOP dataset")
+
+
+def open_sequence(source: Path, *, split: str | None, scene: int | None, camera: Path | None) -> FrameSequence:
+    """The sequence at a path: a BOP dataset where it has a models folder, else a folder of images or a video file.
+
+    Args:
+        source: Folder or file.
+        split: Of a BOP dataset.
+        scene: Of a BOP dataset; may be left out where it has only one.
+        camera: BOP `camera.json`, for images and videos.
+
+    Raises:
+        DatasetError: There is no such path, or it holds no frames.
+        ConfigError: A scene must be chosen, a camera is missing, or an option is for the other kind of source.
+        CameraError: The camera file is no camera.
+    """
+    if not source.exists():
+        raise DatasetError(f"{source}: no such folder or file; give a BOP dataset, a folder of images or a video")
+    if source.is_dir() and any(source.glob("models*")):
+        if camera is not None:
+            raise ConfigError("--camera is for images and videos; a BOP dataset brings its own cameras")
+        dataset = BopDataset(source, split)
+        if scene is None and len(dataset.scene_ids) > 1:
+            some = ", ".join(map(str, dataset.scene_ids[:10]))
+            raise ConfigError(f"{source}: has {len(dataset.scene_ids)} scenes ({some}); choose one with --scene")
+        chosen = BopScene(dataset=dataset, scene_id=dataset.scene_ids[0] if scene is None else scene)
+        dataset.scene_path(chosen.scene_id)
+        return chosen
+    if split is not None:
+        raise ConfigError(f"--split is for BOP datasets; {source} has no models folder, so it is none")
+    if camera is None:
+        raise ConfigError(f"{source}: images and videos need --camera, a BOP camera.json with fx, fy, cx, cy")
+    seen_by = read_camera(camera)
+    if source.is_dir():
+        return ImageFolder(folder=source, camera=seen_by, scene_id=scene or 0)
+    return VideoFile(file=source, camera=seen_by, scene_id=scene or 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FileCamera:
+    """A camera from a file.
+
+    Attributes:
+        file: Where it stands.
+        K: Camera matrix.
+        size_px: Width and height of its images; None where the file does not say.
+    """
+
+    file: Path
+    K: Float[Array, "3 3"]
+    size_px: tuple[int, int] | None = None
+
+    def frame(self, image: UInt8[Array, "h w 3"], name: str) -> Frame:
+        """An image that this camera took.
+
+        Raises:
+            CameraError: It has another size than the camera.
+        """
+        found = (image.shape[1], image.shape[0])
+        if self.size_px is not None and found != self.size_px:
+            raise CameraError(
+                f"{name}: found {found[0]} x {found[1]} px, expected {self.size_px[0]} x {self.size_px[1]} px as "
+                f"{self.file} says; give the camera of these images"
+            )
+        try:
+            return Frame(image=image, K=self.K)
+        except CameraError as error:
+            raise CameraError(f"{name}, with {self.file}: {error}") from error
+
+
+def read_camera(file: Path) -> FileCamera:
+    """A BOP `camera.json`: fx, fy, cx, cy in pixels, and width and height where they are given.
+
+    Raises:
+        CameraError: The file is missing, not JSON, or lacks one of the former.
+    """
+    try:
+        content: Any = json.loads(file.read_text(encoding="utf-8"))
+        K = intrinsics(*(float(content[key]) for key in ("fx", "fy", "cx", "cy")))
+        size_px = (int(content["width"]), int(content["height"])) if {"width", "height"} <= set(content) else None
+        return FileCamera(file=file, K=K, size_px=size_px)
+    except OSError as error:
+        raise CameraError(f"{file}: cannot be read ({error.strerror}); give a BOP camera.json") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CameraError(f"{file}: found no numbers fx, fy, cx, cy ({error}); give a BOP camera.json") from error
+
+
+def _rgb(image: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+class VideoWriter:
+    """Writes RGB frames to a video file until it is closed; a context manager.
+
+    Args:
+        file: Path; the ending decides the container (.mp4, .avi, ...).
+        fps: Frames a second.
+    """
+
+    def __init__(self, file: Path, fps: float) -> None:
+        self._file, self._fps = file, fps
+        self._writer: cv2.VideoWriter | None = None
+
+    def __enter__(self) -> "VideoWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._writer is not None:
+            self._writer.release()
+
+    def write(self, image: UInt8[Array, "h w 3"]) -> None:
+        """Append a frame; the first decides the size.
+
+        Raises:
+            DatasetError: OpenCV has no encoder for this kind of file, or a frame has another size.
+        """
+        height_px, width_px = image.shape[:2]
+        if self._writer is None:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            code = cv2.VideoWriter.fourcc(*("MJPG" if self._file.suffix.lower() == ".avi" else "mp4v"))
+            self._writer = cv2.VideoWriter(str(self._file), code, self._fps, (width_px, height_px))
+            self._size = (width_px, height_px)
+            if not self._writer.isOpened():
+                raise DatasetError(
+                    f"{self._file}: OpenCV cannot write such a video; choose a name ending in .mp4 or .avi"
+                )
+        if (width_px, height_px) != self._size:
+            found, first = f"{width_px} x {height_px}", f"{self._size[0]} x {self._size[1]}"
+            raise DatasetError(f"{self._file}: a frame has {found} px, the first had {first} px; a video has one size")
+        self._writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
