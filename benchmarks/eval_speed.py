@@ -21,11 +21,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from evalkit import metrics
-from evalkit.evaluator import Evaluator
-from evalkit.files import load_result_files
-from evalkit.nearest import NearestPoints
-from evalkit.pairing import Pair, pair_up
+from evalkit.evaluation.evaluator import Evaluator
+from evalkit.inputs.pairing import Pair, pair_up
+from evalkit.inputs.result_files import load_result_files
+from evalkit.pose_errors import metrics
+from evalkit.pose_errors.nearest_points import NearestPoints
 from posecore import se3
 from posecore.bop import BopDataset, symmetry_transforms
 

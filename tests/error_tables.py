@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
-from evalkit.table import COLUMNS
+from evalkit.error_table import COLUMNS
 
 PERFECT: Mapping[str, float | bool] = {
     "found": True,

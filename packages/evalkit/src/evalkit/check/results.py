@@ -12,9 +12,9 @@ from posecore.bop.result_table import LineFault, parse_results
 from posecore.bop.results import metres_fault, read_result_bytes, unknown_ids
 from posecore.errors import PoseError, ResultFileError
 
+from evalkit.check.annotations import ROUGH_ROTATION
 from evalkit.check.findings import Findings
-from evalkit.check.pixels import off_image_px
-from evalkit.check.scenes import ROUGH_ROTATION
+from evalkit.check.images import off_image_px
 
 Array = np.ndarray
 TIME_TOLERANCE_S = 1e-3

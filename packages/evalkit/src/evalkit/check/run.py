@@ -6,13 +6,13 @@ from pathlib import Path
 from posecore.bop import BopDataset
 from posecore.errors import PoseError
 
+from evalkit.check.annotations import check_scenes
 from evalkit.check.findings import Findings
+from evalkit.check.images import check_pixels
 from evalkit.check.models import check_models
-from evalkit.check.pixels import check_pixels
 from evalkit.check.results import check_results
-from evalkit.check.scenes import check_scenes
+from evalkit.check.self_test import check_truth
 from evalkit.check.targets import check_targets
-from evalkit.check.truth import check_truth
 
 SAMPLES = 100
 

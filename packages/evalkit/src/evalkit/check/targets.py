@@ -7,8 +7,8 @@ from posecore.bop import BopDataset
 from posecore.bop.jsonfile import integer, read_json
 from posecore.errors import DatasetError
 
+from evalkit.check.annotations import Scenes
 from evalkit.check.findings import Findings
-from evalkit.check.scenes import Scenes
 
 EDITIONS = ("bop19", "bop24")
 

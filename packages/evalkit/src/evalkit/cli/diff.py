@@ -79,7 +79,7 @@ def diff(
     from posecore.files import write_atomic
 
     from evalkit.diff import differences, judge, open_sides, parse_rule
-    from evalkit.diff.output import csv_text, json_text, text
+    from evalkit.diff.text import csv_text, json_text, text
 
     parsed = [parse_rule(rule) for rule in rules]
     named = (result_a, result_b)

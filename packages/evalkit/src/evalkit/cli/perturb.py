@@ -58,8 +58,8 @@ def perturb(
     from posecore.bop import BopDataset
     from posecore.errors import ConfigError
 
-    from evalkit.pairing import Level
-    from evalkit.perturb import PROTOCOLS, levels_of, perturb_dataset
+    from evalkit.inputs.pairing import Level
+    from evalkit.inputs.perturbation import PROTOCOLS, levels_of, perturb_dataset
 
     if protocol is not None:
         if angles or translations:

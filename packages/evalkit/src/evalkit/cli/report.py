@@ -43,8 +43,8 @@ def report(
     """
     from posecore.bop import BopDataset
 
-    from evalkit.files import dataset_of, find_result_files
-    from evalkit.report import write_report
+    from evalkit.inputs.result_files import dataset_of, find_result_files
+    from evalkit.report.write import write_report
 
     here = Path()
     paths = list(results) or find_result_files(here, dataset is not None)

@@ -50,9 +50,9 @@ def tables(
     """
     from posecore.bop import BopDataset
 
-    from evalkit.files import dataset_of, find_result_files
-    from evalkit.formats import require_suffixes, text_of, write_tables
-    from evalkit.paper import paper_tables, score_files
+    from evalkit.inputs.result_files import dataset_of, find_result_files
+    from evalkit.tables.model import require_suffixes, text_of, write_tables
+    from evalkit.tables.paper import paper_tables, score_files
 
     require_suffixes(out)
     here = Path()

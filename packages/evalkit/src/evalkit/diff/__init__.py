@@ -1,6 +1,6 @@
 """One result file against another: paired deltas with intervals, newly failed and newly solved poses, rules for CI."""
 
-from evalkit.diff.differences import Change, Difference, differences
+from evalkit.diff.deltas import Change, Difference, differences
 from evalkit.diff.measures import MEASURES
 from evalkit.diff.rules import COUNTS, Rule, Verdict, judge, parse_rule
 from evalkit.diff.sides import Side, Sides, open_sides

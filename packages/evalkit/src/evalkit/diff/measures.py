@@ -9,7 +9,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from evalkit.scores.definitions import AUC_LIMIT_M
-from evalkit.scores.values import add_s_m, area_under_recall, average_recalls, found_errors, solved
+from evalkit.scores.per_pose import add_s_m, area_under_recall, average_recalls, found_errors, solved
 
 Array = np.ndarray
 

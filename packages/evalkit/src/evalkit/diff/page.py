@@ -4,17 +4,17 @@ from collections.abc import Mapping, Sequence
 
 import pandas as pd
 
-from evalkit import html
-from evalkit.diff.differences import Difference
+from evalkit.diff.deltas import Difference
 from evalkit.diff.measures import MEASURES, Measure
-from evalkit.diff.output import IDS, line_of
 from evalkit.diff.rules import Verdict
 from evalkit.diff.sides import Side
-from evalkit.formats import Cell, Column, Interval, Row, Table
-from evalkit.html import Section
-from evalkit.page import cases
-from evalkit.scored import CaseKey
+from evalkit.diff.text import IDS, line_of
+from evalkit.evaluation.scored_file import CaseKey
+from evalkit.report import html
+from evalkit.report.html import Section
+from evalkit.report.page import cases
 from evalkit.scores import DEFINITIONS
+from evalkit.tables.model import Cell, Column, Interval, Row, Table
 
 NAN = float("nan")
 

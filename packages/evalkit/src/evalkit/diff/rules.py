@@ -8,7 +8,7 @@ from typing import Literal
 
 from posecore.errors import ConfigError
 
-from evalkit.diff.differences import Change, Difference
+from evalkit.diff.deltas import Change, Difference
 from evalkit.diff.measures import MEASURES
 
 OPERATORS: Mapping[str, Callable[[float, float], bool]] = {"<=": le, ">=": ge, "<": lt, ">": gt}

@@ -11,10 +11,10 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
 
-from evalkit.evaluator import Evaluator, VssKind
-from evalkit.files import dataset_of, load_result_files
-from evalkit.scored import Scored, score_file
-from evalkit.table import COLUMNS
+from evalkit.error_table import COLUMNS
+from evalkit.evaluation.evaluator import Evaluator, VssKind
+from evalkit.evaluation.scored_file import Scored, score_file
+from evalkit.inputs.result_files import dataset_of, load_result_files
 
 NAMES_COLUMN = "results"
 """Of a table of errors: which result file a line is of."""
@@ -28,7 +28,7 @@ class Side:
         name: what tables call it.
         path: where it lies.
         sha256: of its bytes.
-        table: its errors, see `evalkit.table`.
+        table: its errors, see `evalkit.error_table`.
         scored: the same with its poses; None where only a table of errors was given.
     """
 

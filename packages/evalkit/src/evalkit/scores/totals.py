@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from evalkit.scores.values import Values, score_values
-from evalkit.table import column
+from evalkit.error_table import column
+from evalkit.scores.per_pose import Values, score_values
 
 Array = np.ndarray
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evalkit.bootstrap import Units, resample
-from evalkit.files import ResultFile
-from evalkit.formats import Cell, Column, Interval, Row, Table
-from evalkit.refinement import method_names
-from evalkit.scores.values import Values
+from evalkit.inputs.result_files import ResultFile
+from evalkit.scores.bootstrap import Units, resample
+from evalkit.scores.per_pose import Values
+from evalkit.tables.model import Cell, Column, Interval, Row, Table
+from evalkit.tables.paper_refinement import method_names
 from evalkit.tracking.scores import ANGLES, AXES, track_scores
 from evalkit.tracking.tracks import Track
 

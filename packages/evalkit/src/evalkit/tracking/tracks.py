@@ -12,8 +12,8 @@ from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
 
-from evalkit.files import ResultFile
-from evalkit.pairing import truths_of
+from evalkit.inputs.pairing import truths_of
+from evalkit.inputs.result_files import ResultFile
 
 Array = np.ndarray
 

@@ -1,0 +1,1 @@
+"""From a BOP dataset and result files to the error table."""

@@ -1,0 +1,1 @@
+"""Errors of single poses: VSS, VSD, MSSD, MSPD, ADD, ADI, rotation, translation."""

@@ -1,0 +1,82 @@
+"""The errors of many poses of one object at once, as columns."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+from posecore.bop import ModelInfo, symmetry_transforms
+from posecore.mesh import Mesh
+from posecore.symmetry import align_ball, is_ball
+from scipy.spatial import ConvexHull, QhullError
+
+from evalkit.pose_errors import metrics
+from evalkit.pose_errors.nearest_points import NearestPoints
+
+Array = np.ndarray
+ERRORS = (
+    *("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px"),
+    *("re_rad", "re_sym_rad", "te_m", "dx_m", "dy_m", "dz_m"),
+)
+"""Columns that are NaN where an estimate is missing."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """A mesh that errors are measured on, with what is made of it once."""
+
+    mesh: Mesh
+    info: ModelInfo
+    nearest: NearestPoints = field(init=False)
+    hull_m: Float[Array, "h 3"] = field(init=False)
+    symmetries: Float[Array, "s 4 4"] = field(init=False)
+
+    def __post_init__(self) -> None:
+        points_m = np.asarray(self.mesh.vertices_m, np.float64)
+        object.__setattr__(self, "nearest", NearestPoints(points_m))
+        object.__setattr__(self, "hull_m", hull(points_m))
+        object.__setattr__(self, "symmetries", symmetry_transforms(self.info))
+
+    def symmetries_of(
+        self, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"]
+    ) -> Float[Array, "s 4 4"] | Float[Array, "b 2 4 4"]:
+        """The object's symmetries; a ball's are the identity and, for each pair, the one that aligns it exactly."""
+        continuous = self.info.symmetries_continuous
+        if not is_ball(continuous):
+            return self.symmetries
+        aligned = [align_ball(continuous, truth, estimate) for estimate, truth in zip(T_est, T_gt, strict=True)]
+        return np.asarray(np.stack([np.broadcast_to(np.eye(4), T_est.shape), np.array(aligned)], axis=1))
+
+
+def pose_errors(
+    model: Model, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"], K: Float[Array, "b 3 3"]
+) -> dict[str, Float[Array, " b"]]:
+    """Every error in `ERRORS` for each pair of poses.
+
+    Args:
+        model: of the object.
+        T_est: estimates `T_cam_obj`, metres.
+        T_gt: true poses.
+        K: intrinsics of their images, pixels.
+    """
+    points_m, symmetries = np.asarray(model.mesh.vertices_m, np.float64), model.symmetries_of(T_est, T_gt)
+    mspd_px, proj_px, proj_sym_px = metrics.projection_errors(T_est, T_gt, K, points_m, symmetries)
+    dx_m, dy_m, dz_m = metrics.te_axes(T_est, T_gt).T
+    values = (
+        metrics.add(T_est, T_gt, points_m),
+        metrics.adi(T_est, T_gt, model.nearest),
+        metrics.mssd(T_est, T_gt, model.hull_m, symmetries),
+        *(mspd_px, proj_px, proj_sym_px),
+        metrics.re(T_est, T_gt),
+        metrics.re_symmetric(T_est, T_gt, symmetries),
+        metrics.te(T_est, T_gt),
+        *(dx_m, dy_m, dz_m),
+    )
+    return dict(zip(ERRORS, values, strict=True))
+
+
+def hull(points_m: Float[Array, "n 3"]) -> Float[Array, "h 3"]:
+    """Vertices of the convex hull; all points where they are few or lie in a plane."""
+    try:
+        return np.asarray(points_m[ConvexHull(points_m).vertices])
+    except (QhullError, ValueError):
+        return points_m

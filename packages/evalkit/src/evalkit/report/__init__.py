@@ -1,0 +1,1 @@
+"""The HTML report: what it says, its plots, pictures and page."""

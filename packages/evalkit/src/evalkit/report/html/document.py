@@ -1,0 +1,38 @@
+"""A whole page in one file: style and script are written into it."""
+
+from collections.abc import Sequence
+from functools import cache
+from html import escape
+from importlib.resources import files
+
+from evalkit.report.html.elements import Section
+
+
+@cache
+def _asset(name: str) -> str:
+    return files("evalkit.report.html").joinpath(name).read_text(encoding="utf-8")
+
+
+def page(title: str, head: str, sections: Sequence[Section]) -> str:
+    """A document: the title, what stands below it, a table of contents, the sections that have something to show.
+
+    Args:
+        title: plain text.
+        head: HTML between the title and the first section.
+        sections: with different headings.
+    """
+    shown = [section for section in sections if not section.is_empty]
+    links = "".join(f'<li><a href="#{section.anchor}">{escape(section.heading)}</a></li>' for section in shown)
+    body = "".join(
+        f'<section id="{section.anchor}"><h2>{escape(section.heading)}</h2>{"".join(section.parts)}</section>'
+        for section in shown
+    )
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<link rel="icon" href="data:,">'  # no request for a favicon
+        f"<title>{escape(title)}</title><style>{_asset('style.css')}</style></head><body>"
+        f'<nav class="contents" aria-label="Contents"><ul>{links}</ul></nav>'
+        f"<main><header><h1>{escape(title)}</h1>{head}</header>{body}</main>"
+        f"<script>{_asset('sort.js')}</script></body></html>\n"
+    )

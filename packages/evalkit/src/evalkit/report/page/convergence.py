@@ -1,0 +1,64 @@
+"""Convergence from starts that were perturbed by steps: curves and tables."""
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from evalkit.report import html, svg_plots
+from evalkit.report.svg_plots import Look, Series
+from evalkit.tables.report_tables import curve_tables
+
+LEVEL_PLOTS = (
+    ("Rotation error under 5°", "under_5deg", True),
+    ("Rotation error under 10°", "under_10deg", True),
+    ("Rotation error under 20°", "under_20deg", True),
+    ("Translation error under 0.1 diameter", "te_under_0.1d", True),
+    ("Diverged", "diverged", True),
+    ("Mean final rotation error, deg", "re_sym_deg_mean", False),
+    ("Mean final translation error, mm", "te_mm_mean", False),
+)
+LEVEL_LABELS = {"angle": "start rotated by, degrees", "translation": "start moved by, diameters"}
+
+
+def parts(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
+    """Plots and tables; nothing where no start was perturbed by steps."""
+    return [*_plots(summary, looks), *map(html.table, curve_tables(summary))]
+
+
+def _plots(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
+    shown = []
+    for kind, label in LEVEL_LABELS.items():
+        drawn = [(file, look) for file, look in zip(summary["files"], looks, strict=True) if kind in file["by_level"]]
+        if not drawn:
+            continue
+        figures = [
+            svg_plots.line_plot(
+                title,
+                label,
+                "share of poses" if share else title.rsplit(", ", 1)[-1],
+                [_series(file["name"], look, file["by_level"][kind], key) for file, look in drawn],
+                share=share,
+            )
+            for title, key, share in LEVEL_PLOTS
+        ]
+        shown.append(f'<h3>{escape(label.capitalize())}</h3><div class="plots">{"".join(figures)}</div>')
+    return shown
+
+
+def _series(name: str, look: Look, points: Sequence[Mapping[str, Any]], key: str) -> Series:
+    ends = [(point.get("intervals") or {}).get(key) or (None, None) for point in points]
+    return Series(
+        name=name,
+        look=look,
+        x=_numbers([point["level"] for point in points]),
+        y=_numbers([point[key] for point in points]),
+        low=_numbers([low for low, _ in ends]),
+        high=_numbers([high for _, high in ends]),
+        is_measured=True,
+    )
+
+
+def _numbers(values: Sequence[float | None]) -> np.ndarray:
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)

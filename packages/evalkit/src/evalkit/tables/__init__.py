@@ -1,0 +1,1 @@
+"""Text tables: their model, the report's and the paper's tables, Markdown, LaTeX, CSV and JSON."""

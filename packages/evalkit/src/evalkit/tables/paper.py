@@ -1,0 +1,90 @@
+"""The paper's tables from result files: refinement, loss ablation, perturbation curves, whichever the files hold."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from posecore.bop import BopDataset
+
+from evalkit.evaluation.evaluator import Evaluator, VssKind
+from evalkit.evaluation.scored_file import Scored, score_file
+from evalkit.inputs.perturbation import departures
+from evalkit.inputs.result_files import load_result_files
+from evalkit.scores.convergence import by_level, by_level_and_object, level_object_tables, level_tables
+from evalkit.tables.model import Table
+from evalkit.tables.paper_refinement import (
+    By,
+    Method,
+    ablation_table,
+    before_after_table,
+    error_table,
+    methods_of,
+    score_by_group_table,
+)
+
+
+def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full", *, workers: int = 1) -> list[Scored]:
+    """Evaluate result files, starts first, in so many processes.
+
+    Raises:
+        PoseError: a file or the dataset is not usable; the message names it.
+    """
+    with Evaluator(dataset, vss, workers=workers) as evaluator:
+        return [score_file(evaluator, file) for file in load_result_files(paths, dataset)]
+
+
+def paper_tables(scored: Sequence[Scored], *, by: By = "object", resamples: int = 0, seed: int = 0) -> list[Table]:
+    """Tables of the paper's section 4 for these files.
+
+    Files whose starts were perturbed by steps give curves (4.1), in total and by object. The others give mean errors
+    and recalls (table 2a), VSS and ADD by object (table 1), each object before and after, and, where several methods
+    are no start poses, VSS side by side (table 2b).
+
+    Args:
+        scored: starts first.
+        by: what is counted once in totals and stands in a row or column of its own.
+        resamples: for 95 % bootstrap intervals, 0 for none.
+        seed: of the resampling.
+    """
+    methods = methods_of(scored)
+    stepped = [bool(by_level(method.table)) for method in methods]
+    curves = [method for method, is_stepped in zip(methods, stepped, strict=True) if is_stepped]
+    rest = [method for method, is_stepped in zip(methods, stepped, strict=True) if not is_stepped]
+    said = [
+        f"{method.name}: {text}."
+        for method, item, is_stepped in zip(methods, scored, stepped, strict=True)
+        for text in departures(item.file.sidecar)
+        if is_stepped
+    ]
+    tables = _refinement_tables(rest, by, resamples, seed) if rest else []
+    return tables + _curve_tables(curves, said, resamples, seed)
+
+
+def _refinement_tables(methods: Sequence[Method], by: By, resamples: int, seed: int) -> list[Table]:
+    tables = [
+        error_table(methods, by=by, resamples=resamples, seed=seed),
+        score_by_group_table(methods, score="vss_mean", by=by, resamples=resamples, seed=seed),
+        score_by_group_table(methods, score="add_recall_0.1d", by=by, resamples=resamples, seed=seed),
+        before_after_table(methods, by=by, resamples=resamples, seed=seed),
+    ]
+    refined = [method for method in methods if not method.is_start]
+    if len(refined) > 1:
+        tables.append(ablation_table(refined, by=by, resamples=resamples, seed=seed))
+    return tables
+
+
+def _curve_tables(methods: Sequence[Method], said: Sequence[str], resamples: int, seed: int) -> list[Table]:
+    total = {method.name: by_level(method.table, resamples=resamples, seed=seed) for method in methods}
+    objects = {method.name: by_level_and_object(method.table, resamples=resamples, seed=seed) for method in methods}
+    several = len({obj_id for found in objects.values() for obj_id in found}) > 1
+    tables = level_tables(total) + (level_object_tables(objects) if several else [])
+    return [
+        Table(
+            title=table.title,
+            name=table.name,
+            columns=table.columns,
+            rows=table.rows,
+            note=" ".join([table.note, *said]),
+            best=table.best,
+        )
+        for table in tables
+    ]
