@@ -19,7 +19,7 @@ from synthgen.config import load_config
 from synthgen.draw.target import make_target
 from synthgen.engine import RenderedScene
 from synthgen.image.sensor import display_from_linear
-from synthgen.pair import PairMaker, limit_threads
+from synthgen.pairs.pair_maker import PairMaker, limit_threads
 from synthgen.scene import Scene
 
 REFERENCE_SAMPLES = 512

@@ -29,11 +29,11 @@ import psutil
 from posecore import shard
 from posecore.camera import Camera
 from posecore.mesh import Mesh, load_mesh
-from synthgen import dataset
-from synthgen.assets import Assets
 from synthgen.config import SynthConfig, load_config
 from synthgen.draw.target import make_target
-from synthgen.pair import PairMaker, concatenate, limit_threads
+from synthgen.inputs.assets import Assets
+from synthgen.pairs import data_card
+from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
 
 Fields = dict[str, Any]
 
@@ -64,7 +64,7 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     limit_threads(1)
     scenes = max(scenes, scenes_per_shard(config))  # encoding is timed on whole shards
     maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
-    card = dataset.make_card(config, config.shard_size, {1: mesh}, Assets())
+    card = data_card.make_card(config, config.shard_size, {1: mesh}, Assets())
     for scene in range(3):  # loads, compiles
         maker.samples(10_000_000 + scene)
     watch = Stopwatch()

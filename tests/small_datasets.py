@@ -6,10 +6,10 @@ from pathlib import Path
 from posecore import shard
 from posecore.mesh import Mesh
 from posecore.shard import ShardWriter
-from synthgen import dataset
-from synthgen.assets import Assets
 from synthgen.config import SynthConfig
-from synthgen.run.shardrun import ShardJob, ShardRenderer
+from synthgen.inputs.assets import Assets
+from synthgen.pairs import data_card
+from synthgen.run.shard_job import ShardJob, ShardRenderer
 
 
 def write_dataset(
@@ -22,9 +22,9 @@ def write_dataset(
     quarantined: Collection[int] = (),
 ) -> ShardJob:
     """Render a dataset as `synthgen render` does, all of it or its first shards."""
-    card = dataset.make_card(config, n, meshes, Assets())
+    card = data_card.make_card(config, n, meshes, Assets())
     writer = ShardWriter.create(str(url), card)
-    for key, data in dataset.model_files(meshes, {}).items():
+    for key, data in data_card.model_files(meshes, {}).items():
         writer.add_file(key, data)
     job = ShardJob(config=config, card=writer.card, meshes=meshes)
     renderer = ShardRenderer(job)

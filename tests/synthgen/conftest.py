@@ -7,7 +7,7 @@ import pytest
 from posecore.mesh import Mesh, load_mesh
 from synthgen.config import SynthConfig, load_config
 from synthgen.draw.target import Target, make_target
-from synthgen.pair import PairMaker
+from synthgen.pairs.pair_maker import PairMaker
 
 SMALL = (
     "engine=raster",

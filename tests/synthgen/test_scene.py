@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from posecore.camera import Camera, intrinsics
 from posecore.errors import ConfigError
-from synthgen.engines import make_engine
+from synthgen.engines.make import make_engine
 from synthgen.scene import Background, Light, Material, Scene, SceneObject, Sensor
 
 

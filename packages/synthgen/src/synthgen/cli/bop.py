@@ -8,8 +8,8 @@ from synthgen.cli.console import progress_bar, start_logging, stoppable
 from synthgen.cli.options import scene_options
 
 if TYPE_CHECKING:
-    from synthgen.bop.framemaker import Split
-    from synthgen.sources import Sources
+    from synthgen.bop.frame_maker import Split
+    from synthgen.inputs.sources import Sources
 
 
 @click.command()
@@ -71,8 +71,8 @@ def bop(
     """
     from posecore.errors import ConfigError
 
-    from synthgen.bop import bopset
-    from synthgen.bop.framemaker import FramePlan
+    from synthgen.bop import dataset_writer
+    from synthgen.bop.frame_maker import FramePlan
     from synthgen.config import load_config
 
     start_logging(verbose)
@@ -94,7 +94,7 @@ def bop(
     total = sum(count for _, count in plan.scenes())
     with stoppable(out), progress_bar(quiet) as bar:
         task = bar.add_task("frames", total=total)
-        bopset.write_dataset(
+        dataset_writer.write_dataset(
             out,
             config,
             meshes,

@@ -63,11 +63,11 @@ def cut(
     from posecore.bop import BopDataset, splits_of
     from posecore.shard import ShardWriter
 
-    from synthgen import annotated
     from synthgen.config import CutConfig
-    from synthgen.cutter import cut_pairs
-    from synthgen.dataset import estimated_bytes, model_files
     from synthgen.machine import size_text
+    from synthgen.pairs import cut_plan
+    from synthgen.pairs.cut import cut_pairs
+    from synthgen.pairs.data_card import estimated_bytes, model_files
     from synthgen.run import lock
     from synthgen.run.estimate import check_free_space
 
@@ -79,11 +79,11 @@ def cut(
             f"{dataset} has the splits {', '.join(there)}: name one with --split, not one that you report results on"
         )
     images = BopDataset(dataset, split, sensor)
-    planned = annotated.plan(images, config, hypotheses)
+    planned = cut_plan.plan(images, config, hypotheses)
     for reason, count in sorted(planned.left_out.items()):
         click.echo(f"{images.split_path}: left out: {count} {reason}", err=True)
     with lock.held(out), stoppable(out):
-        writer = ShardWriter.create(out, annotated.make_card(images, planned, config, drawn=hypotheses is None))
+        writer = ShardWriter.create(out, cut_plan.make_card(images, planned, config, drawn=hypotheses is None))
         missing = planned.n - len(writer.committed()) * config.shard_size
         size = estimated_bytes(config.patch_px, config.contour_points, max(0, missing))
         check_free_space(out, size)

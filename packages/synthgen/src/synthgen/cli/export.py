@@ -31,7 +31,7 @@ def export(shards: str, out: Path, layout: str, overwrite: bool, quiet: bool) ->
     """
     from posecore.shard import ShardReader
 
-    from synthgen.export import refuse_existing, to_hdf5, to_webdataset
+    from synthgen.pairs.export import refuse_existing, to_hdf5, to_webdataset
 
     refuse_existing(out, overwrite)
     n = ShardReader(shards).n

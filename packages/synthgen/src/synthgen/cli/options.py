@@ -29,7 +29,7 @@ def scene_options(command: F) -> F:
 
     @functools.wraps(command)
     def with_sources(**values: Any) -> Any:
-        from synthgen.sources import Sources
+        from synthgen.inputs.sources import Sources
 
         return command(sources=Sources(**{name: values.pop(name) for name in _SOURCES}), **values)
 

@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from posecore.shard import Encoded
 
     from synthgen.config import SynthConfig
-    from synthgen.run.shardrun import ShardJob
-    from synthgen.sources import Sources
+    from synthgen.inputs.sources import Sources
+    from synthgen.run.shard_job import ShardJob
 
 MOST_WORKERS = 8
 MEASURED_FROM = 1000  # pairs: for fewer the measurement would cost more than it is worth
@@ -91,10 +91,10 @@ def render(
     """
     from posecore.shard import ShardWriter
 
-    from synthgen import dataset
     from synthgen.config import load_config
-    from synthgen.run import lock, pipeline
-    from synthgen.run.shardrun import ShardJob
+    from synthgen.pairs import data_card
+    from synthgen.run import dispatcher, lock
+    from synthgen.run.shard_job import ShardJob
 
     if workers and scheduler:
         raise click.UsageError(
@@ -105,7 +105,7 @@ def render(
     start_logging(verbose)
     config, gpus = _with_device(load_config(preset, overrides, values), scheduler)
     meshes, assets = sources.meshes(), sources.assets()
-    card = dataset.make_card(config, n, meshes, assets)
+    card = data_card.make_card(config, n, meshes, assets)
     cores = len(os.sched_getaffinity(0))
     workers = workers or len(gpus) or min(MOST_WORKERS, cores)
     if only is not None:
@@ -114,16 +114,16 @@ def render(
     new = "://" not in out and not Path(out).exists()
     with lock.held(out), stoppable(out), _leaving_nothing_useless(Path(out) if new else None):
         writer = ShardWriter.create(out, card)
-        for key, data in dataset.model_files(meshes, sources.infos(meshes)).items():
+        for key, data in data_card.model_files(meshes, sources.infos(meshes)).items():
             writer.add_file(key, data)
-        threads = 1 if scheduler else pipeline.threads_per_worker(workers, cores)
+        threads = 1 if scheduler else dispatcher.threads_per_worker(workers, cores)
         job = ShardJob(config=config, card=writer.card, meshes=meshes, assets=assets, threads=threads)
         damaged = writer.damaged()
         for shard_id, what in sorted(damaged.items())[:3]:
             click.echo(f"{out}: shard {shard_id} is damaged ({what}) and is rendered again", err=True)
         if len(damaged) > 3:
             click.echo(f"{out}: {len(damaged) - 3} further shards are damaged and are rendered again", err=True)
-        done, total = pipeline.progress(job, writer, damaged)
+        done, total = dispatcher.progress(job, writer, damaged)
         click.echo(
             f"{out}: {done} of {total} pairs are there, rendering {total - done} with {config.engine}, "
             f"{_prospect(out, job, total - done, None if scheduler else workers)}",
@@ -135,7 +135,7 @@ def render(
             def on_shard(encoded: "Encoded") -> None:
                 bar.advance(task, encoded.line["n"])
 
-            pipeline.run(
+            dispatcher.run(
                 job,
                 writer,
                 workers=workers,
@@ -160,7 +160,7 @@ def _leaving_nothing_useless(new: Path | None) -> Iterator[None]:
         new: A folder that was not there before the command; None when it was.
     """
     from posecore.errors import PoseError
-    from posecore.shard.group import MANIFEST
+    from posecore.shard.layout import MANIFEST
 
     try:
         yield
@@ -184,12 +184,12 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     """
     from posecore.errors import RenderError
 
-    from synthgen import dataset
     from synthgen.machine import size_text
+    from synthgen.pairs import data_card
     from synthgen.run.estimate import check_free_space, estimate
 
     if missing < MEASURED_FROM:
-        size = dataset.estimated_bytes(job.config.patch_px, job.config.contour_points, missing)
+        size = data_card.estimated_bytes(job.config.patch_px, job.config.contour_points, missing)
         check_free_space(out, size)
         return f"about {size_text(size)} more"
     try:
@@ -208,7 +208,7 @@ def _duration(seconds: float) -> str:
 
 def _one_sample(out: str, job: "ShardJob", index: int, save: Path | None) -> None:
     """Make one sample again, say whether it is the stored one, and end with 1 when it is not."""
-    from synthgen.inspect.only import run_only
+    from synthgen.inspect.reproduce import run_only
 
     made = run_only(out, job, index, save)
     click.echo(made.text)
@@ -220,7 +220,7 @@ def _with_device(config: "SynthConfig", scheduler: str | None) -> tuple["SynthCo
     """The configuration with the device that 'auto' means here, since it goes into the card, and the GPUs it names."""
     from dataclasses import replace
 
-    from synthgen.devices import choose_device, list_gpus, visible_gpus
+    from synthgen.engines.devices import choose_device, list_gpus, visible_gpus
 
     if config.device == "cpu":
         return config, ()

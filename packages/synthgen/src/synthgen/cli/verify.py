@@ -54,7 +54,7 @@ def verify(
 
     from synthgen.machine import cores
     from synthgen.verify.page import report_page
-    from synthgen.verify.run import verify as run
+    from synthgen.verify.verify import verify as run
 
     reader = ShardReader(shards)
     with progress_bar(quiet) as bar:

@@ -12,7 +12,7 @@ from posecore.mesh import Mesh
 from posecore.se3 import make_T, random_rotation
 
 from synthgen.config import OccluderConfig
-from synthgen.draw.streams import Purpose, Subject, stream
+from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.scene import Material, SceneObject
 
 Array = np.ndarray

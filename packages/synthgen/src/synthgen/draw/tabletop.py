@@ -14,8 +14,8 @@ from posecore.mesh import Mesh
 from posecore.se3 import apply, make_T, random_rotation, rotation_from_rotvec
 
 from synthgen.config import TabletopConfig, ViewConfig
-from synthgen.draw.rest import Rest
-from synthgen.draw.streams import Purpose, Subject, child_seed, stream
+from synthgen.draw.random_streams import Purpose, Subject, child_seed, stream
+from synthgen.draw.resting_pose import Rest
 from synthgen.image import background
 from synthgen.scene import Background, Material, SceneObject
 

@@ -13,10 +13,10 @@ from posecore.mesh import Mesh
 from posecore.window import fixed_side_px
 from scipy.spatial import ConvexHull, QhullError
 
-from synthgen.assets import Assets
 from synthgen.config import SynthConfig
 from synthgen.draw import occluders, tabletop
-from synthgen.draw.rest import Rests
+from synthgen.draw.resting_pose import Rests
+from synthgen.inputs.assets import Assets
 
 Array = np.ndarray
 

@@ -14,11 +14,11 @@ from typing import Literal
 from posecore.errors import RenderError
 
 from synthgen.config import SynthConfig
-from synthgen.dataset import versions
-from synthgen.devices import list_gpus
 from synthgen.engine import ENGINE_NAMES
+from synthgen.engines.devices import list_gpus
 from synthgen.inspect.speed import Speed
 from synthgen.machine import free_bytes, machine
+from synthgen.pairs.data_card import versions
 
 State = Literal["ok", "warning", "missing"]
 

@@ -9,7 +9,7 @@ from posecore import config as config_tools
 from posecore.errors import DatasetError
 from posecore.shard import ShardReader, n_shards
 
-from synthgen.bop.bopset import CARD as BOP_CARD
+from synthgen.bop.dataset_writer import CARD as BOP_CARD
 from synthgen.config import CutConfig, load_config
 from synthgen.verify.facts import manifest_lines
 

@@ -13,8 +13,8 @@ from posecore.errors import PoseError, RenderError, StorageError
 from posecore.processes import die_with_parent
 
 from synthgen.machine import free_bytes, size_text
-from synthgen.pair import concatenate
-from synthgen.run.shardrun import ShardJob, ShardRenderer, scenes_in
+from synthgen.pairs.pair_maker import concatenate
+from synthgen.run.shard_job import ShardJob, ShardRenderer, scenes_in
 
 _START_S = 300.0  # for Blender to start and the first scene to compile its kernels
 _SPARE_BYTES = 256 * 2**20  # of a disk that is not filled to the last byte

@@ -19,10 +19,10 @@ from posecore.errors import RenderError
 from posecore.files import sha256_bytes
 from posecore.processes import die_with_parent
 
-from synthgen import dataset
-from synthgen.blender.paths import forget_blenders_paths
-from synthgen.run import scratch
-from synthgen.run.shardrun import SceneError, ShardJob, ShardRenderer
+from synthgen.engines.blender import scratch
+from synthgen.engines.blender.paths import forget_blenders_paths
+from synthgen.pairs import data_card
+from synthgen.run.shard_job import SceneError, ShardJob, ShardRenderer
 
 GROWTH_LIMIT_BYTES = 1 << 30
 _RECYCLE_S = 0.5  # a rescheduled shard bounces between scheduler and worker until the worker is marked as leaving
@@ -173,7 +173,7 @@ def problem_with(job: ShardJob, threads: int) -> str | None:
             f"it with `dask worker ADDRESS --nthreads 1 --nworkers {threads}`"
         )
     wanted: Mapping[str, Any] = job.card.get("versions", {})
-    found = dataset.versions(job.config) if wanted else {}
+    found = data_card.versions(job.config) if wanted else {}
     for name in sorted(wanted):
         if found.get(name) != wanted[name]:
             return (

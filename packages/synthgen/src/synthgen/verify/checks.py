@@ -17,7 +17,7 @@ from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from posecore.window import Window, diameter_window, fixed_window
 
 from synthgen.image.region import inside_image
-from synthgen.pair import MAX_ATTEMPTS, MAX_HYPOTHESIS_ATTEMPTS
+from synthgen.pairs.pair_maker import MAX_ATTEMPTS, MAX_HYPOTHESIS_ATTEMPTS
 from synthgen.verify.facts import Batch
 
 Array = np.ndarray

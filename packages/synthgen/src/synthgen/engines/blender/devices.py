@@ -1,0 +1,43 @@
+"""The GPUs that Cycles finds. As a program it writes their numbers as JSON: see `synthgen.engines.devices`."""
+
+import json
+import sys
+from typing import Any
+
+import bpy
+
+from synthgen.engine import GPU_DEVICES, Device
+from synthgen.engines.blender.quiet import blender_output_caught
+
+
+def gpu_counts() -> dict[Device, int]:
+    """Number of GPUs by kind, kinds without any left out."""
+    counts: dict[Device, int] = {kind: len(_found(kind)) for kind in GPU_DEVICES}
+    return {kind: count for kind, count in counts.items() if count}
+
+
+def use_gpus(kind: Device) -> None:
+    """Have Cycles trace on every GPU of a kind that this process sees (CUDA_VISIBLE_DEVICES), and on nothing else."""
+    preferences = _preferences()
+    preferences.compute_device_type = kind.upper()
+    mine = _found(kind)
+    for device in preferences.devices:
+        device.use = device in mine
+
+
+def _found(kind: Device) -> list[Any]:
+    name = kind.upper()
+    try:
+        return [device for device in _preferences().get_devices_for_type(name) if device.type == name]
+    except (TypeError, ValueError):  # a kind that this build of Blender does not know
+        return []
+
+
+def _preferences() -> Any:
+    return bpy.context.preferences.addons["cycles"].preferences
+
+
+if __name__ == "__main__":
+    with blender_output_caught("looking for GPUs"):
+        found = gpu_counts()
+    sys.stdout.write(json.dumps(found) + "\n")

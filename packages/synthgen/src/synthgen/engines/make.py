@@ -1,0 +1,28 @@
+"""The one place that turns an engine's name into an engine."""
+
+from posecore.errors import ConfigError
+
+from synthgen.engine import ENGINE_NAMES, Device, Engine
+
+
+def make_engine(name: str, *, threads: int = 0, device: Device = "cpu") -> Engine:
+    """Make an engine by name; only then is what it needs imported.
+
+    Args:
+        name: 'cycles' (path tracing, the default elsewhere), 'eevee' (for GPUs) or 'raster' (drafts, no Blender).
+        threads: Threads a Blender engine may use, 0 for all cores.
+        device: Where Cycles traces; the other engines draw with OpenGL and take what it gives.
+
+    Raises:
+        ConfigError: The name is unknown.
+        RenderError: The engine cannot start here, e.g. because Blender's module is not installed.
+    """
+    if name == "raster":
+        from synthgen.engines.raster import RasterEngine
+
+        return RasterEngine()
+    if name == "cycles" or name == "eevee":
+        from synthgen.engines.blender.engine import BlenderEngine
+
+        return BlenderEngine(name, threads=threads, device=device)
+    raise ConfigError(f"engine: got {name!r}, expected one of {', '.join(ENGINE_NAMES)}")

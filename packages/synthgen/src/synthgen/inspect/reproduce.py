@@ -1,0 +1,167 @@
+"""One sample of a dataset, made again and held against the stored one."""
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import numpy as np
+from posecore.errors import ConfigError, ShardError
+from posecore.files import write_atomic
+from posecore.shard import GROUP, ShardReader, ShardWriter, field_table
+from posecore.store import open_store
+
+from synthgen.inspect.preview import sample_row, title_row
+from synthgen.run.shard_job import ShardJob, ShardRenderer
+from synthgen.verify.facts import manifest_lines
+
+Array = np.ndarray
+
+SUFFIXES = (".npz", ".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Reproduction:
+    """A sample that was rendered again.
+
+    Attributes:
+        index: Of the sample.
+        scene: Its scene.
+        hypothesis: Which hypothesis of the scene.
+        sample: Every field, as a reader of shards would get it.
+        differences: What differs from the stored sample, empty when nothing does; None where none is stored.
+        absent: Why none is stored.
+    """
+
+    index: int
+    scene: int
+    hypothesis: int
+    sample: Mapping[str, Array]
+    differences: tuple[str, ...] | None
+    absent: str = ""
+
+    @property
+    def text(self) -> str:
+        """The outcome in one line."""
+        name = f"sample {self.index} (scene {self.scene}, hypothesis {self.hypothesis})"
+        if self.differences is None:
+            return f"{name}: rendered, and not compared: {self.absent}"
+        if self.differences:
+            return f"{name}: differs from the stored one: {'; '.join(self.differences)}"
+        return f"{name}: identical to the stored one"
+
+
+def reproduce(url: str, job: ShardJob, index: int, *, must_compare: bool = False) -> Reproduction:
+    """Render one sample in this process, in its main thread, and compare it with the stored one, bit for bit.
+
+    Args:
+        url: Dataset; it need not be there yet.
+        job: What `synthgen render` would render into it.
+        index: Which sample.
+        must_compare: Whether it is an error that no such sample is stored; nothing is rendered then.
+
+    Raises:
+        ConfigError: There is no such sample in the job.
+        ShardError: The dataset is another one than this job's, the sample's shard is damaged, or nothing is stored to
+            compare it with.
+        RenderError: A renderer fails.
+    """
+    n, per_scene = int(job.card["n"]), job.config.hypotheses_per_scene
+    if not 0 <= index < n:
+        raise ConfigError(f"--only {index}: the dataset has the samples 0 to {n - 1}")
+    shard_id, place = divmod(index, job.config.shard_size)
+    scene, hypothesis = divmod(index, per_scene)
+    stored, absent, quarantined = _stored(url, job, shard_id)
+    if stored is None and must_compare:
+        raise ShardError(
+            f"--only {index}: {absent}, so there is nothing to compare the sample with; start the same command without "
+            "--only first, or give --save FILE to look at it"
+        )
+    renderer = ShardRenderer(job)
+    try:
+        fields = renderer.scene(shard_id, scene, quarantined)
+    finally:
+        renderer.close()
+    sample = _as_stored(job, {name: values[hypothesis : hypothesis + 1] for name, values in fields.items()})
+    different = None
+    if stored is not None:
+        there = {name: np.asarray(values[place]) for name, values in stored.items()}
+        different = tuple(text for name in sample if (text := _difference(name, there[name], sample[name])))
+    return Reproduction(
+        index=index, scene=scene, hypothesis=hypothesis, sample=sample, differences=different, absent=absent
+    )
+
+
+def save_sample(file: Path, made: Reproduction) -> None:
+    """Write a sample's fields (.npz), or its row of a contact sheet (.png, .jpg).
+
+    Raises:
+        ConfigError: Another ending.
+        StorageError: The file cannot be written.
+    """
+    check_suffix(file)
+    if file.suffix.lower() == ".npz":
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, **dict(made.sample))
+        write_atomic(file, buffer.getvalue())
+        return
+    sheet = np.concatenate([title_row(), sample_row(made.sample, made.index)])
+    ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
+    assert ok
+    write_atomic(file, data.tobytes())
+
+
+def check_suffix(file: Path) -> None:
+    """Refuse a file that `save_sample` cannot write, before anything is rendered."""
+    if file.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"--save {file}: expected a file that ends in {', '.join(SUFFIXES)}")
+
+
+def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, Array] | None, str, frozenset[int]]:
+    """The stored shard, or why there is none, and its scenes in quarantine."""
+    if open_store(url).get(GROUP) is None:
+        return None, f"there is no dataset at {url}", frozenset()
+    ShardWriter.create(url, job.card)  # refuses another dataset as a resumed run does; writes nothing where one is
+    reader = ShardReader(url)
+    if shard_id not in reader.committed:
+        return None, f"its shard {shard_id} is not rendered yet", frozenset()
+    line = manifest_lines(reader)[shard_id]
+    return reader.read(shard_id), "", frozenset(line.get("quarantined", ()))
+
+
+def _as_stored(job: ShardJob, fields: Mapping[str, Array]) -> dict[str, Array]:
+    """A sample as it comes back from a shard: through the same quantisation and the same codecs."""
+    card = {**job.card, "n": 1, "shard_size": 1}
+    with TemporaryDirectory() as folder:
+        writer = ShardWriter.create(str(Path(folder) / "one"), card)
+        writer.commit(writer.encode(0, fields))
+        values = ShardReader(writer.url).read(0)
+    return {name: np.asarray(value[0]) for name, value in values.items()}
+
+
+def _difference(name: str, stored: Array, made: Array) -> str:
+    """How a field differs, empty where every bit is the same."""
+    if stored.shape == made.shape and stored.dtype == made.dtype and stored.tobytes() == made.tobytes():
+        return ""
+    if stored.shape != made.shape:
+        return f"{name} has the shape {made.shape}, stored is {stored.shape}"
+    gap = np.abs(np.asarray(stored, np.float64) - np.asarray(made, np.float64))
+    unit = next(field.unit for field in field_table() if field.name == name)
+    said = "" if unit in ("1", "bits") else f" {unit}"
+    return f"{name} ({int((gap != 0).sum())} of {gap.size} values, by up to {np.nanmax(gap):.4g}{said})"
+
+
+def run_only(url: str, job: ShardJob, index: int, save: Path | None) -> Reproduction:
+    """Make one sample again for the command line, and save it when asked to.
+
+    Raises:
+        ShardError: Nothing is stored to compare it with, and it is not to be saved either; or see `reproduce`.
+    """
+    if save is not None:
+        check_suffix(save)
+    made = reproduce(url, job, index, must_compare=save is None)
+    if save is not None:
+        save_sample(save, made)
+    return made

@@ -1,0 +1,200 @@
+"""Several datasets of pairs as one: rendered ones with ones cut out of images, or more scenes of the same recipe."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from posecore import shard
+from posecore.errors import ShardError
+from posecore.mesh import mesh_digest
+from posecore.shard import ShardReader, ShardWriter, load_meshes
+
+from synthgen.pairs.export import complete_dataset, model_keys
+
+Array = np.ndarray
+MODELS_INFO = "models/models_info.json"
+_SAME = ("schema", "schema_version", "patch_px", "contour_points", "units")
+_CAMERA = ("width_px", "height_px", "fx", "fy", "cx", "cy")
+
+
+def open_parts(urls: Sequence[str]) -> list[ShardReader]:
+    """Datasets that can be merged.
+
+    Raises:
+        ShardError: One is incomplete, is given twice, or differs from the first in what all samples must share; or two
+            show the same scenes and number them otherwise.
+    """
+    parts = [complete_dataset(url) for url in urls]
+    _require_one_numbering(parts)
+    first = parts[0]
+    digests: dict[str, str] = {}
+    objects: dict[int, tuple[str, str, str]] = {}
+    for part in parts:
+        if part.digest in digests:
+            raise ShardError(f"{part.url}: holds the same pairs as {digests[part.digest]}; name it once")
+        digests[part.digest] = part.url
+        for key in _SAME:
+            if part.card[key] != first.card[key]:
+                raise ShardError(
+                    f"{part.url}: {key} is {part.card[key]}, expected {first.card[key]} as in {first.url}; only "
+                    "datasets that agree in it can be merged"
+                )
+        infos = json.loads(part.file(MODELS_INFO))
+        for obj_id, mesh in load_meshes(part).items():
+            symmetries = {key: value for key, value in infos[str(obj_id)].items() if key.startswith("symmetries")}
+            described = mesh_digest(mesh), json.dumps(symmetries, sort_keys=True), part.url
+            known = objects.setdefault(obj_id, described)
+            if known[:2] != described[:2]:
+                what = "another mesh" if known[0] != described[0] else "other symmetries"
+                raise ShardError(
+                    f"{part.url}: object {obj_id} has {what} than in {known[2]}; rename its file, whose number is the "
+                    "object's, or make all datasets from the same one"
+                )
+    return parts
+
+
+def _source(card: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What the scenes of a dataset are, as far as its card tells: equal ones may be the same."""
+    if "source" in card:
+        return "cut", card["source"]["dataset"], card["source"]["split"]
+    return "rendered", card["seed"], *sorted(entry["sha256"] for entry in card["objects"].values())
+
+
+def _require_one_numbering(parts: Sequence[ShardReader]) -> None:
+    """Refuse parts of which some scenes would count as two: training holds out whole scenes."""
+    blocks: dict[tuple[Any, ...], tuple[int, str]] = {}
+    inside: dict[tuple[Any, ...], str] = {}
+    for part in parts:
+        if "merged" in part.card:
+            for below in _sources_below(part.card):
+                if inside.setdefault(below, part.url) != part.url:
+                    raise ShardError(
+                        f"{part.url}: may show scenes that {inside[below]} shows, and both are merged; merge the parts "
+                        "of both in their place"
+                    )
+            continue
+        size = int(part.card["cut"].get("images_per_scene", 0)) if "cut" in part.card else 0
+        first, url = blocks.setdefault(_source(part.card), (size, part.url))
+        if first != size:
+            raise ShardError(
+                f"{part.url}: images_per_scene is {size}, expected {first} as in {url}, which was cut out of images of "
+                "the same name: else training would not hold out whole scenes; if these are other images, give their "
+                "folder another name and cut them again"
+            )
+    for source, (_, url) in blocks.items():
+        if source in inside:
+            raise ShardError(
+                f"{url}: shows scenes that {inside[source]}, which is merged, may show too; merge the parts of that "
+                "one in its place"
+            )
+
+
+def _sources_below(card: Mapping[str, Any]) -> set[tuple[Any, ...]]:
+    """Of what a merged dataset was merged of."""
+    found: set[tuple[Any, ...]] = set()
+    for part in card["merged"]:
+        found |= _sources_below(part["card"]) if "merged" in part["card"] else {_source(part["card"])}
+    return found
+
+
+def merged_card(parts: Sequence[ShardReader]) -> dict[str, Any]:
+    """The data card of the parts together; those of the parts lie in it, with the digest that names their content."""
+    cards = [part.card for part in parts]
+    camera = {key: cards[0]["camera"][key] for key in _CAMERA}
+    shared = all(
+        card["camera"].get("shared", True) and {key: card["camera"][key] for key in _CAMERA} == camera for card in cards
+    )
+    objects: dict[str, dict[str, Any]] = {}
+    windows = {card.get("windows", "fixed") for card in cards}
+    for card in cards:
+        for obj_id, entry in card["objects"].items():
+            known = objects.setdefault(obj_id, dict(entry))
+            if known["window_side_px"] != entry["window_side_px"]:
+                windows.add("mixed")
+                known["window_side_px"] = max(known["window_side_px"], entry["window_side_px"])
+    return {
+        "n": sum(part.n for part in parts),
+        "shard_size": cards[0]["shard_size"],
+        **{key: cards[0][key] for key in _SAME if not key.startswith("schema")},
+        "depth_step_m": max(card["depth_step_m"] for card in cards),
+        "seed": [card["seed"] for card in cards],
+        "windows": windows.pop() if len(windows) == 1 else "mixed",
+        "objects": dict(sorted(objects.items(), key=lambda item: int(item[0]))),
+        "camera": camera | {"shared": shared},
+        "versions": cards[0]["versions"],
+        "merged": [{"digest": part.digest, "card": dict(part.card)} for part in parts],
+    }
+
+
+def write_merged(
+    parts: Sequence[ShardReader], writer: ShardWriter, on_shard: Callable[[int], None] = lambda n: None
+) -> None:
+    """Write the pairs of all parts, one part after the other; scenes are numbered on, so that none is two.
+
+    Parts whose scenes may be the same, as two that were cut out of the same images, share their numbers.
+
+    Shards that are there are left as they are.
+
+    Args:
+        parts: As `open_parts` gives them.
+        writer: Of a dataset with their `merged_card`.
+        on_shard: Told the pairs of every shard, those that were there too.
+    """
+    infos: dict[str, Any] = {}
+    copied: set[str] = set()
+    for part in parts:
+        for key in model_keys(part):
+            if key != MODELS_INFO and key not in copied:
+                copied.add(key)
+                writer.add_file(key, part.file(key))
+        infos = json.loads(part.file(MODELS_INFO)) | infos
+    text = json.dumps(dict(sorted(infos.items(), key=lambda item: int(item[0]))), indent=2)
+    writer.add_file(MODELS_INFO, text.encode())
+    there = set(writer.committed()) - set(writer.damaged())
+    rows = _Rows(parts)
+    for shard_id in range(shard.n_shards(writer.card)):
+        count = shard.samples_in(writer.card, shard_id)
+        if shard_id not in there:
+            first = shard_id * int(writer.card["shard_size"])
+            writer.commit(writer.encode(shard_id, rows.between(first, first + count)))
+        on_shard(count)
+
+
+class _Rows:
+    """Rows of the parts by their index in the whole; keeps the shard that it read last."""
+
+    def __init__(self, parts: Sequence[ShardReader]) -> None:
+        self._parts = parts
+        self._first = np.cumsum([0, *(part.n for part in parts)]).tolist()
+        sources = [(number,) if "merged" in part.card else _source(part.card) for number, part in enumerate(parts)]
+        scenes: dict[tuple[Any, ...], int] = {}
+        for part, source in zip(parts, sources, strict=True):
+            last = max(int(part.read(i, ["scene_index"])["scene_index"].max()) for i in part.committed)
+            scenes[source] = max(scenes.get(source, 0), last + 1)
+        first = dict(zip(scenes, np.cumsum([0, *scenes.values()]).tolist(), strict=False))
+        self._scenes = [first[source] for source in sources]
+        self._last: tuple[tuple[int, int], dict[str, Array]] | None = None
+
+    def between(self, start: int, end: int) -> dict[str, Array]:
+        """Every field of the rows from `start` up to before `end`."""
+        pieces = list(self._pieces(start, end))
+        return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+    def _pieces(self, start: int, end: int) -> Iterator[Mapping[str, Array]]:
+        for number, part in enumerate(self._parts):
+            low, high = max(start, self._first[number]), min(end, self._first[number + 1])
+            row = low - self._first[number]
+            while low < high:
+                shard_id, place = divmod(row, part.shard_size)
+                values = self._shard(number, shard_id)
+                count = min(part.n_samples(shard_id) - place, high - low)
+                yield {name: rows[place : place + count] for name, rows in values.items()}
+                low, row = low + count, row + count
+
+    def _shard(self, number: int, shard_id: int) -> dict[str, Array]:
+        if self._last is None or self._last[0] != (number, shard_id):
+            values = self._parts[number].read(shard_id)
+            values["scene_index"] = values["scene_index"] + self._scenes[number]
+            self._last = (number, shard_id), values
+        return self._last[1]

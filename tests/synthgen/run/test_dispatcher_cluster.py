@@ -1,0 +1,185 @@
+"""A dask cluster of real processes: a scheduler and workers that were started by hand."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from click.testing import CliRunner
+from synthgen.cli import main
+from synthgen.inputs.assets import Assets
+from synthgen.run import cluster as dask_cluster
+from synthgen.run import worker
+from synthgen.run.shard_job import ShardJob
+
+N = "46"
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def command(tug_ply, out, small_set, *extra):
+    return [
+        *(sys.executable, "-m", "synthgen.cli", "render", "--object", str(tug_ply), "--out", str(out), "--quiet"),
+        *("--n", N, *small_set, *extra),
+    ]
+
+
+def error_line(result):
+    assert result.returncode == 1, result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(lines) == 1, result.stderr
+    assert "Traceback" not in result.stderr
+    return lines[0]
+
+
+def kill(process):
+    """End a process and what it started."""
+    try:
+        family = [*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)]
+    except psutil.NoSuchProcess:  # it has ended, and was waited for
+        return
+    for member in family:
+        with suppress(psutil.NoSuchProcess):
+            member.kill()
+    process.wait(timeout=60)
+
+
+class Cluster:
+    """A scheduler and workers, as `dask scheduler` and `dask worker` start them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.file = folder / "scheduler.json"
+        self.processes: list[subprocess.Popen] = []
+        self.start("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1")
+        self.address = self.wait_for_address()
+
+    def start(self, kind, *arguments, **environment):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), *arguments],
+            env={**os.environ, **environment},
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
+        self.processes.append(process)
+        return process
+
+    def worker(self, *arguments, **environment):
+        return self.start("worker", "--no-dashboard", *(arguments or ("--nthreads", "1")), **environment)
+
+    def wait_for_address(self):
+        for _ in range(600):
+            if self.file.exists() and (text := self.file.read_text()):
+                return json.loads(text)["address"]
+            time.sleep(0.05)
+        raise AssertionError("the scheduler does not start")
+
+    def close(self):
+        for process in self.processes:
+            kill(process)
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    made = Cluster(tmp_path)
+    yield made
+    made.close()
+
+
+def renderers(process):
+    """Worker processes below a nanny."""
+    return [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+
+
+@pytest.mark.slow
+def test_a_cluster_that_loses_a_worker_makes_the_same_bytes(cluster, tmp_path, tug_ply, small_set):
+    undisturbed = subprocess.run(
+        command(tug_ply, tmp_path / "local", small_set, "--workers", "1"), capture_output=True, text=True, check=False
+    )
+    assert undisturbed.returncode == 0, undisturbed.stderr
+    first, second = cluster.worker(), cluster.worker()
+    out = tmp_path / "shards"
+    driver = subprocess.Popen(
+        command(tug_ply, out, small_set, "--scheduler", cluster.address), stderr=subprocess.PIPE, text=True
+    )
+    started = time.monotonic()
+    while not (out / "manifest.jsonl").exists() and driver.poll() is None and time.monotonic() - started < 60:
+        time.sleep(0.01)
+    victims = renderers(first)
+    for victim in victims:
+        victim.kill()
+    _, errors = driver.communicate(timeout=120)
+    assert victims
+    assert driver.returncode == 0, errors
+    assert (out / "manifest.jsonl").read_text().count("\n") == 12
+    assert tree(out) == tree(tmp_path / "local")
+    assert first.poll() is None and second.poll() is None  # the job is gone, the cluster stays
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path, tug_ply, small_set):
+    cluster.worker()
+    out = tmp_path / "shards"
+    arguments = command(tug_ply, out, [*small_set, "--n", "900"], "--scheduler", cluster.address)
+    driver = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
+    started = time.monotonic()
+    while not (out / "manifest.jsonl").exists() and driver.poll() is None and time.monotonic() - started < 60:
+        time.sleep(0.01)
+    cluster.processes[0].kill()
+    _, errors = driver.communicate(timeout=120)
+    result = subprocess.CompletedProcess(arguments, driver.returncode, "", errors)
+    assert "the scheduler is gone; start it and its workers" in error_line(result)
+
+
+@pytest.mark.slow
+def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp_path, tug_ply, small_set):
+    out = tmp_path / "shards"
+    arguments = command(tug_ply, out, small_set, "--scheduler", cluster.address)
+    hiding = tmp_path / "hiding"
+    hiding.mkdir()
+    (hiding / "synthgen.py").write_text("")
+    old = tmp_path / "old" / "synthgen-0.0.1.dist-info"
+    old.mkdir(parents=True)
+    (old / "METADATA").write_text("Metadata-Version: 2.1\nName: synthgen\nVersion: 0.0.1\n")
+    for folder, words in (
+        (hiding, ("the workers cannot take the job", "install the same version of synthgen on every machine")),
+        (old.parent, ("has synthgen 0.0.1, the command ",)),
+    ):
+        process = cluster.worker(PYTHONPATH=str(folder))
+        result = subprocess.run(arguments, capture_output=True, text=True, timeout=100, check=False)
+        for word in words:
+            assert word in error_line(result)
+        kill(process)
+
+
+def test_a_worker_says_why_it_cannot_render(tug, config_of):
+    job = ShardJob(config=config_of(), card={}, meshes={1: tug})
+    assert worker.problem_with(job, 1) is None
+    assert "has 4 threads, expected 1" in worker.problem_with(job, 4)
+    lost = replace(job, assets=Assets(photos=("/nowhere/a.png", "/nowhere/b.png")))
+    assert "cannot read /nowhere/a.png (2 of 2 photographs" in worker.problem_with(lost, 1)
+
+
+def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, tug_ply, small_set, monkeypatch):
+    monkeypatch.setattr(dask_cluster, "ANSWER_S", 1.0)
+    for address in ("tcp://127.0.0.1:9", "node0"):
+        arguments = command(tug_ply, tmp_path / "shards", small_set, "--scheduler", address)[3:]
+        result = CliRunner().invoke(main, arguments)
+        assert result.exit_code == 1
+        assert f"Error: --scheduler {address}: no dask scheduler answers there" in result.stderr
+        assert "Traceback" not in result.output
+
+
+def test_workers_and_scheduler_exclude_each_other(tmp_path, tug_ply, small_set):
+    arguments = command(tug_ply, tmp_path / "shards", small_set, "--scheduler", "tcp://node0:8786", "--workers", "2")
+    result = CliRunner().invoke(main, arguments[3:])
+    assert result.exit_code == 2
+    assert "give one of them" in result.stderr
+    assert not (tmp_path / "shards").exists()

@@ -1,0 +1,141 @@
+"""What goes wrong in workers: crashes, hangs, growth, and scenes that are to blame for it."""
+
+import ctypes
+import functools
+import json
+import logging
+import os
+import signal
+import sys
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+
+import cloudpickle
+import numpy as np
+import pytest
+from posecore.errors import RenderError
+from posecore.shard import ShardReader, ShardWriter
+from synthgen.engines.blender import scratch
+from synthgen.inputs.assets import Assets
+from synthgen.pairs import data_card
+from synthgen.pairs.pair_maker import concatenate
+from synthgen.run import dispatcher
+from synthgen.run.shard_job import REPLACEMENT_ATTEMPT, ShardJob, ShardRenderer
+from synthgen.run.worker import RendererPlugin
+
+cloudpickle.register_pickle_by_value(sys.modules[__name__])  # workers cannot import a test module
+
+N = 14
+SEGFAULT, HANG, FAILURE = 2, 3, 5  # scenes, two to a shard
+
+
+class PoisonedRenderer(ShardRenderer):
+    """Some scenes crash, fail or hang with Python's lock held, unless another draw takes their place."""
+
+    def _maker(self):
+        maker = super()._maker()
+        return SimpleNamespace(samples=functools.partial(self.samples, maker))
+
+    def samples(self, maker, scene_index, keep, first_attempt):
+        _, remove = scratch.make_folder()  # as Blender's engine has one
+        if first_attempt == 0:
+            self.misbehave(scene_index)
+        remove()
+        return maker.samples(scene_index, keep, first_attempt)
+
+    def misbehave(self, scene_index):
+        if scene_index == SEGFAULT:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        if scene_index == FAILURE:
+            raise RenderError("Blender failed")
+        if scene_index == HANG:
+            ctypes.PyDLL(None).pause()
+
+
+class AllFail(PoisonedRenderer):
+    def misbehave(self, scene_index):
+        raise RenderError("no scene renders")
+
+
+class Growing(PoisonedRenderer):
+    """Keeps memory with every shard, and writes down which process rendered it."""
+
+    log: Path
+
+    def __init__(self, job):
+        super().__init__(job)
+        self.kept = []
+
+    def misbehave(self, scene_index):
+        self.kept.append(np.ones(60 << 20, np.uint8))
+        with self.log.open("a") as file:
+            file.write(f"{os.getpid()}\n")
+
+
+def with_renderer(renderer, monkeypatch, **attributes):
+    """Have workers render with another renderer."""
+
+    class Plugin(RendererPlugin):
+        def setup(self, worker):
+            super().setup(worker)
+            self.renderer = renderer(self.job)
+            for name, value in attributes.items():
+                setattr(self.renderer, name, value)
+
+    monkeypatch.setattr(dispatcher, "RendererPlugin", Plugin)
+
+
+@pytest.fixture
+def job_and_writer(tmp_path, tug, config_of):
+    config = config_of()
+    writer = ShardWriter.create(str(tmp_path / "shards"), data_card.make_card(config, N, {1: tug}, Assets()))
+    return ShardJob(config=config, card=writer.card, meshes={1: tug}, threads=1), writer
+
+
+def run(job, writer, **settings):
+    dispatcher.run(job, writer, **{"workers": 1, "scheduler": None, "on_shard": lambda encoded: None, **settings})
+
+
+@pytest.mark.slow
+def test_scenes_that_crash_fail_or_hang_are_replaced_and_said(job_and_writer, monkeypatch, caplog, maker_of):
+    job, writer = job_and_writer
+    with_renderer(PoisonedRenderer, monkeypatch)
+    caplog.set_level(logging.WARNING, "synthgen")
+    run(job, writer, shard_timeout_s=3.0)
+    poisoned = {SEGFAULT, FAILURE, HANG}
+    assert writer.quarantined() == sorted(poisoned)
+    lines = [json.loads(line) for line in Path(writer.url, "manifest.jsonl").read_text().splitlines()]
+    assert {line["shard"]: line["quarantined"] for line in lines if "quarantined" in line} == {1: [2, 3], 2: [5]}
+    assert sum("quarantined" in record.message for record in caplog.records) == 3
+    reader, maker = ShardReader(writer.url), maker_of()
+    assert reader.complete
+    for shard_id in (0, 1):
+        scenes = [2 * shard_id, 2 * shard_id + 1]
+        firsts = [REPLACEMENT_ATTEMPT if scene in poisoned else 0 for scene in scenes]
+        expected = concatenate([maker.samples(s, 2, first) for s, first in zip(scenes, firsts, strict=True)])
+        found = reader.read(shard_id)
+        assert np.array_equal(found["T_cam_obj"], expected["T_cam_obj"])
+        assert np.array_equal(found["scene_rgb"], expected["scene_rgb"])
+        assert (found["rejected"].reshape(2, 2) >= np.array(firsts)[:, None]).all()
+
+
+@pytest.mark.slow
+def test_a_renderer_that_always_fails_stops_the_run(job_and_writer, monkeypatch):
+    job, writer = job_and_writer
+    with_renderer(AllFail, monkeypatch)
+    with pytest.raises(RenderError, match=r"fails at more than 3 of 7 scenes.*no scene renders"):
+        run(job, writer)
+    assert writer.committed() == []
+
+
+@pytest.mark.slow
+def test_a_worker_that_grows_is_replaced_between_shards(job_and_writer, monkeypatch, tmp_path, caplog):
+    job, writer = job_and_writer
+    monkeypatch.setattr(dispatcher.cluster, "memory_limit_bytes", lambda workers: 800 << 20)  # a quarter may be grown
+    with_renderer(Growing, monkeypatch, log=tmp_path / "pids")
+    run(job, writer)
+    assert ShardReader(writer.url).complete
+    pids = Counter((tmp_path / "pids").read_text().split())
+    assert len(pids) >= 2
+    assert sum(pids.values()) == 7  # no scene was rendered twice
