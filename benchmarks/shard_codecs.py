@@ -20,13 +20,13 @@ import cv2
 import numpy as np
 from numcodecs import blosc, zstd
 from posecore.mesh import load_mesh
-from posecore.shard import Field, ShardReader, ShardWriter, field_table, files
-from synthgen import dataset
-from synthgen.assets import Assets
+from posecore.shard import Field, ShardReader, ShardWriter, field_table, sharding_codec
 from synthgen.config import load_config
 from synthgen.draw.target import make_targets
 from synthgen.image.background import list_photos
-from synthgen.pair import PairMaker, concatenate, limit_threads
+from synthgen.inputs.assets import Assets
+from synthgen.pairs import data_card
+from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
 
 Array = np.ndarray
 SHARD = 64
@@ -62,25 +62,32 @@ def render(
     per_scene = config.hypotheses_per_scene
     scenes = concatenate(maker.samples(i, per_scene) for i in range(-(-n // per_scene)))
     maker.close()
-    card = dataset.make_card(config, n, meshes, assets)
+    card = data_card.make_card(config, n, meshes, assets)
     return {name: values[:n] for name, values in scenes.items()}, json.loads(json.dumps(card))
 
 
-def ours(field: Field, card: dict, codec: str | None = None, chunk: int = files.MOST_CHUNK_SAMPLES) -> Way:
+def ours(field: Field, card: dict, codec: str | None = None, chunk: int = sharding_codec.MOST_CHUNK_SAMPLES) -> Way:
     """The shard files' own code, with another codec or chunk length where given."""
     used = codec or field.codec
     rows = chunk if "P" in field.shape else SHARD
     size = field.size(card["patch_px"], card["contour_points"])
 
     def decode(parts: list[bytes]) -> Array:
-        stored = files.unpack(parts[0], used, field.dtype, (rows, *size), rows, 0)
+        stored = sharding_codec.unpack(parts[0], used, field.dtype, (rows, *size), rows, 0)
         values = np.empty(stored.shape, field.decoded_dtype)
         field.decode(stored, card, values)
         return values
 
-    name = f"{used}, {rows} together" if codec or chunk != files.MOST_CHUNK_SAMPLES else f"* {used}, {rows} together"
+    name = (
+        f"{used}, {rows} together"
+        if codec or chunk != sharding_codec.MOST_CHUNK_SAMPLES
+        else f"* {used}, {rows} together"
+    )
     return Way(
-        name=name, chunk=rows, encode=lambda x: [files.pack(field.encode(x, card), used, rows, rows)], decode=decode
+        name=name,
+        chunk=rows,
+        encode=lambda x: [sharding_codec.pack(field.encode(x, card), used, rows, rows)],
+        decode=decode,
     )
 
 

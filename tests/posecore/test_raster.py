@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import trimesh
-from posecore import camera, raster_reference, se3
+from posecore import camera, se3
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
-from posecore.raster import DirectionalLight, Instance, Rasteriser, Shading
+from posecore.raster import DirectionalLight, Instance, Rasteriser, Shading, reference
 from scipy.spatial import ConvexHull
 
 K = camera.intrinsics(310.0, 285.0, 70.3, 50.8)
@@ -47,7 +47,7 @@ def test_mask_and_depth_equal_the_numpy_twin(rasteriser: Rasteriser, obj_id: int
     T = poses(10, seed=obj_id)
     layers = rasteriser.render(obj_id, K, T, 140, 100)
     for i in range(len(T)):
-        depth_m, mask = raster_reference.render(mesh, K, T[i], 140, 100)
+        depth_m, mask = reference.render(mesh, K, T[i], 140, 100)
         assert (mask != layers.mask[i]).sum() <= 1  # a pixel centre may lie on an edge within float32
         both = mask & layers.mask[i]
         assert np.median(np.abs(depth_m - layers.depth_m[i])[both]) < 1e-6

@@ -7,8 +7,8 @@ import threading
 import cv2
 import numpy as np
 import torch
-from posecore import raster
 from posecore.bop import BopDataset, read_results, read_sidecar
+from posecore.raster import context
 from refinenet.config import load_config
 from refinenet.models import checkpoint
 from refinenet.models.networks import make_network
@@ -46,12 +46,12 @@ def test_a_real_network_ranks_a_pool_by_its_own_confidence(cli, bop, mesh, frame
 
 def test_a_machine_without_egl_gets_one_line(cli, bop, trained, tmp_path, monkeypatch):
     root, start = bop
-    monkeypatch.setattr(raster, "_threads", threading.local())
+    monkeypatch.setattr(context, "_threads", threading.local())
 
     def no_device(**settings):
         raise Exception("(standalone) XOpenDisplay: cannot open display")
 
-    monkeypatch.setattr(raster.moderngl, "create_context", no_device)
+    monkeypatch.setattr(context.moderngl, "create_context", no_device)
     result = cli(
         "refine", "--checkpoint", trained, "--dataset", root, "--init", start, "--out", tmp_path / "x.csv", "--quiet"
     )

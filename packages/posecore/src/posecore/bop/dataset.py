@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from posecore.bop.annotations import GroundTruth, Target, camera_matrix, depth_scale, ground_truth, visib_fract
+from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import image_size, read_depth, read_rgb
 from posecore.bop.jsonfile import integer, read_json
 from posecore.bop.models_info import MM, ModelInfo, load_models_info
 from posecore.bop.sources import Kind, MaskKind, some
 from posecore.bop.splits import choose_split, open_source
-from posecore.bop.stored import StoredFile
 from posecore.bop.webdataset import ShardSource
 from posecore.camera import Camera
 from posecore.errors import CameraError, DatasetError

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Shaped, UInt8
 
-from posecore.bop.stored import StoredFile, stored
+from posecore.bop.file_slice import StoredFile, stored
 from posecore.errors import DatasetError, StorageError
 from posecore.files import write_atomic
 

@@ -10,9 +10,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Bool
 
+from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS, find_image, read_mask
 from posecore.bop.jsonfile import integer_keys, parse_json
-from posecore.bop.stored import StoredFile
 from posecore.errors import DatasetError
 
 Array = np.ndarray

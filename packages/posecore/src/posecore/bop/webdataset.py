@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool
 
+from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS
 from posecore.bop.jsonfile import integer, integer_keys, parse_json, shown
 from posecore.bop.sources import Kind, Layer, MaskKind, some
-from posecore.bop.stored import StoredFile
 from posecore.errors import DatasetError
 
 Array = np.ndarray

@@ -6,7 +6,7 @@ last. The group's attributes are the data card. Fields come from `data_specs/sha
 """
 
 from posecore.shard.fields import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, Field, field_table, schema
-from posecore.shard.group import GROUP, MANIFEST, n_shards, samples_in
+from posecore.shard.layout import GROUP, MANIFEST, n_shards, samples_in
 from posecore.shard.objects import load_meshes
 from posecore.shard.reader import ShardReader
 from posecore.shard.writer import Encoded, ShardWriter, encode

@@ -27,7 +27,7 @@ class Field:
         dtype: On disk.
         shape: Without the sample axis; "P" patch_px, "C" contour_points.
         unit: Of the decoded value.
-        codec: Inner codecs, see `posecore.shard.files`.
+        codec: Inner codecs, see `posecore.shard.sharding_codec`.
         text: One sentence.
         scale: Decoded value = stored x scale; a name for that entry of the data card; None when stored as it is.
         squared: Stored is the square of the value, a whole number: exact, and float32 when decoded.

@@ -9,9 +9,18 @@ from typing import Any
 import numpy as np
 
 from posecore.errors import ShardError
-from posecore.shard import files
+from posecore.shard import sharding_codec
 from posecore.shard.fields import Field, field_table
-from posecore.shard.group import GROUP, MANIFEST, chunk_shape, n_shards, read_card, read_manifest, samples_in, shard_key
+from posecore.shard.layout import (
+    GROUP,
+    MANIFEST,
+    chunk_shape,
+    n_shards,
+    read_card,
+    read_manifest,
+    samples_in,
+    shard_key,
+)
 from posecore.store import open_store
 
 Array = np.ndarray
@@ -122,7 +131,7 @@ class ShardReader:
         values = np.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
         for first in range(0, len(values), chunk):
             try:
-                stored = files.unpack(data, field.codec, field.dtype, (chunk, *size), self.shard_size, first)
+                stored = sharding_codec.unpack(data, field.codec, field.dtype, (chunk, *size), self.shard_size, first)
             except (ValueError, RuntimeError) as error:
                 raise self._changed(shard_key(field, shard_id), f"does not decode ({error})") from error
             field.decode(stored[: len(values) - first], self.card, values[first : first + chunk])

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from posecore.errors import ShardError
-from posecore.shard import files
+from posecore.shard import sharding_codec
 from posecore.shard.fields import field_table, schema
-from posecore.shard.group import (
+from posecore.shard.layout import (
     GROUP,
     MANIFEST,
     check_same_card,
@@ -159,7 +159,7 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
             found = arrays[field.name].shape if field.name in arrays else "nothing"
             raise ShardError(f"shard {shard_id}, {field.name}: found {found}, expected shape {shape}")
         stored = field.encode(arrays[field.name], card)
-        packed[field.name] = files.pack(stored, field.codec, int(card["shard_size"]), chunk)
+        packed[field.name] = sharding_codec.pack(stored, field.codec, int(card["shard_size"]), chunk)
         digest.update(packed[field.name])
     line = {
         "shard": shard_id,

@@ -3,7 +3,7 @@
 from typing import no_type_check
 
 import numpy as np
-from posecore.compiled import compiled
+from posecore.numba_jit import compiled
 
 
 @compiled

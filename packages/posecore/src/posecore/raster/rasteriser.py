@@ -2,179 +2,27 @@
 
 It draws the hypothesis at inference and in training, silhouettes for the metrics, and whole scenes as the `raster`
 engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mask and depth are exact labels.
-`raster_reference` is the plain twin that tests hold this against.
+`posecore.raster.reference` is the reference implementation that tests hold this against.
 """
 
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from types import TracebackType
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import moderngl
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
+from posecore.raster.context import thread_device
+from posecore.raster.scene import HEADLIGHT, MAX_LIGHTS, Instance, Layers, SceneLayers, Shading
+from posecore.raster.shaders import DEPTH_FRAGMENT_SHADER, DEPTH_VERTEX_SHADER, FRAGMENT_SHADER, VERTEX_SHADER
 
 Array = np.ndarray
 P, R = ParamSpec("P"), TypeVar("R")
-MAX_LIGHTS = 8
 ATLAS_SIDE_PX = 2048  # tiles of one batch share a framebuffer of at most this side: one read-back for all of them
-
-VERTEX_SHADER = """
-#version 330
-uniform mat4 clip_from_cam;
-uniform mat4 cam_from_obj;
-in vec3 position;
-in vec3 normal;
-in vec3 colour;
-in vec2 uv;
-out vec3 p_cam;
-out vec3 n_cam;
-out vec3 base;
-out vec2 texcoord;
-void main() {
-    vec4 p = cam_from_obj * vec4(position, 1.0);
-    p_cam = p.xyz;
-    n_cam = mat3(cam_from_obj) * normal;
-    base = colour;
-    texcoord = uv;
-    gl_Position = clip_from_cam * p;
-}
-"""
-
-# Two-sided: many CAD meshes have flipped faces, so the normal is turned towards the camera.
-FRAGMENT_SHADER = """
-#version 330
-uniform sampler2D image;
-uniform bool textured;
-uniform vec3 tint;
-uniform float ambient;
-uniform float diffuse;
-uniform int n_lights;
-uniform vec3 light_direction[8];
-uniform vec3 light_rgb[8];
-uniform float instance;
-in vec3 p_cam;
-in vec3 n_cam;
-in vec3 base;
-in vec2 texcoord;
-layout(location = 0) out vec4 rgb;
-layout(location = 1) out vec2 depth_instance;
-void main() {
-    vec3 to_eye = normalize(-p_cam);
-    vec3 n = dot(n_cam, n_cam) > 1e-12 ? normalize(n_cam) : to_eye;
-    if (dot(n, to_eye) < 0.0) n = -n;
-    vec3 light = vec3(ambient);
-    if (n_lights == 0) light += diffuse * dot(n, to_eye);
-    for (int i = 0; i < n_lights; ++i) light += diffuse * light_rgb[i] * max(dot(n, light_direction[i]), 0.0);
-    vec3 own = textured ? texture(image, texcoord).rgb : base;
-    rgb = vec4(min(own * tint * light, 1.0), 1.0);
-    depth_instance = vec2(p_cam.z, instance);
-}
-"""
-
-# Where no colours are asked for: a triangle that has less to interpolate costs the software renderer less.
-DEPTH_VERTEX_SHADER = """
-#version 330
-uniform mat4 clip_from_cam;
-uniform mat4 cam_from_obj;
-in vec3 position;
-out float z_cam;
-void main() {
-    vec4 p = cam_from_obj * vec4(position, 1.0);
-    z_cam = p.z;
-    gl_Position = clip_from_cam * p;
-}
-"""
-
-DEPTH_FRAGMENT_SHADER = """
-#version 330
-in float z_cam;
-layout(location = 0) out float depth;
-void main() { depth = z_cam; }
-"""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DirectionalLight:
-    """A light from infinity: unit direction towards it in the camera frame, and its colour."""
-
-    direction_cam: tuple[float, float, float]
-    rgb: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Shading:
-    """Light model in display values: own colour x (ambient + diffuse x lights). Without lights, a headlight."""
-
-    ambient: float = 0.5
-    diffuse: float = 0.5
-    lights: tuple[DirectionalLight, ...] = ()
-
-    def __post_init__(self) -> None:
-        if len(self.lights) > MAX_LIGHTS:
-            raise RenderError(f"shading has {len(self.lights)} lights, expected at most {MAX_LIGHTS}")
-
-
-HEADLIGHT = Shading()
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Instance:
-    """One object of a scene: which mesh, where, and a factor on its colours."""
-
-    obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
-    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Layers:
-    """A batch of renders of one object each.
-
-    Attributes:
-        rgb: (b, h, w, 3) display colours on black, or None when not asked for.
-        depth_m: (b, h, w) camera z in metres, 0 where nothing was hit.
-    """
-
-    rgb: UInt8[Array, "b h w 3"] | None
-    depth_m: Float[Array, "b h w"]
-
-    @property
-    def mask(self) -> Bool[Array, "b h w"]:
-        """Silhouettes."""
-        return self.depth_m > 0
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class SceneLayers:
-    """One render of several objects; `instance` indexes them, -1 where nothing was hit; `rgb` may not be asked for."""
-
-    rgb: UInt8[Array, "h w 3"] | None
-    depth_m: Float[Array, "h w"]
-    instance: Int[Array, "h w"]
-
-
-_threads = threading.local()
-
-
-class _Device:
-    """A GL context, and the lock of who uses it: it is current in one thread, and only while it draws."""
-
-    def __init__(self, context: Any) -> None:
-        self.context = context
-        self._lock = threading.RLock()
-
-    @contextmanager
-    def current(self) -> Iterator[None]:
-        """Make it this thread's; Blender, in the same process, makes a context of its own the current one."""
-        with self._lock, self.context:
-            yield
 
 
 def _drawing(
@@ -191,29 +39,6 @@ def _drawing(
     return wrapped
 
 
-def _thread_device() -> _Device:
-    """The GL context that rasterisers made in this thread share, made once and never released.
-
-    Releasing one ends EGL for the whole process, and contexts made after that draw nothing, without an error.
-    """
-    if not hasattr(_threads, "device"):
-        settings: dict[str, Any] = {"standalone": True, "backend": "egl", "require": 330}
-        try:
-            context: Any = moderngl.create_context(**settings)
-        except Exception as error:  # moderngl raises bare exceptions from several layers
-            reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0]
-            raise RenderError(
-                f"no EGL device for the rasteriser ({reason}); "
-                "install a GPU driver with EGL, or Mesa's software renderer (Debian: libegl1 libgl1-mesa-dri)"
-            ) from error
-        context.gc_mode = "auto"
-        context.enable(moderngl.DEPTH_TEST)
-        context.front_face = "cw"  # image rows run downwards, which turns counter-clockwise faces around
-        _threads.device = _Device(context)
-    device: _Device = _threads.device
-    return device
-
-
 class Rasteriser:
     """Draws meshes at poses; a context manager. One per process; any thread may use it, one at a time.
 
@@ -226,7 +51,7 @@ class Rasteriser:
 
     def __init__(self, meshes: Mapping[int, Mesh]) -> None:
         self._meshes = dict(meshes)
-        self._device = _thread_device()
+        self._device = thread_device()
         self._context = self._device.context
         with self._device.current():
             self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)

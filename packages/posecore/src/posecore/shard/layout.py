@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from posecore.errors import ShardError
-from posecore.shard import files
+from posecore.shard import sharding_codec
 from posecore.shard.fields import Field, field_table, schema
 from posecore.store import Store
 
@@ -31,7 +31,7 @@ def shard_key(field: Field, shard_id: int) -> str:
 def chunk_shape(field: Field, card: Mapping[str, Any]) -> tuple[int, ...]:
     """Shape of a field's inner chunks, samples in front."""
     size = field.size(card["patch_px"], card["contour_points"])
-    return (files.chunk_samples(field.shape, int(card["shard_size"])), *size)
+    return (sharding_codec.chunk_samples(field.shape, int(card["shard_size"])), *size)
 
 
 def metadata(card: Mapping[str, Any]) -> dict[str, bytes]:
@@ -47,7 +47,7 @@ def _array_metadata(field: Field, card: Mapping[str, Any]) -> dict[str, Any]:
     chunk = chunk_shape(field, card)
     sharding = {
         "chunk_shape": list(chunk),
-        "codecs": files.codecs(field.codec, field.dtype, len(chunk)),
+        "codecs": sharding_codec.codecs(field.codec, field.dtype, len(chunk)),
         "index_codecs": [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}],
         "index_location": "end",
     }

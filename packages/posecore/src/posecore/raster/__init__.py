@@ -1,0 +1,23 @@
+"""The headless rasteriser: meshes at poses to colour, camera z and masks."""
+
+from posecore.raster.rasteriser import Rasteriser
+from posecore.raster.scene import (
+    HEADLIGHT,
+    MAX_LIGHTS,
+    DirectionalLight,
+    Instance,
+    Layers,
+    SceneLayers,
+    Shading,
+)
+
+__all__ = [
+    "HEADLIGHT",
+    "MAX_LIGHTS",
+    "DirectionalLight",
+    "Instance",
+    "Layers",
+    "Rasteriser",
+    "SceneLayers",
+    "Shading",
+]
