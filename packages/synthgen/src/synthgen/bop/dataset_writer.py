@@ -1,4 +1,4 @@
-"""Whole camera images in BOP's layout: data to try a refiner on, or to train on, with ground truth."""
+"""Whole camera images with ground truth in BOP's layout, for evaluation or training."""
 
 import json
 import multiprocessing
@@ -31,7 +31,7 @@ from posecore.processes import behave_as_worker, interrupts_ignored
 
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig, migrate
-from synthgen.draw.target import Target, make_targets
+from synthgen.draw.target import TargetObject, make_targets
 from synthgen.engines.blender.paths import forget_blenders_paths
 from synthgen.inputs.assets import Assets
 from synthgen.pairs.data_card import versions
@@ -39,25 +39,25 @@ from synthgen.pairs.pair_maker import limit_threads
 from synthgen.run import lock
 
 CARD = "synthgen.json"
-_FARTHEST_STEP = 65535
+_MAX_DEPTH_STEP = 65535
 _JPG_SPLITS = ("train_pbr",)  # BOP's training images are JPEG, its test images PNG
-_CRASHES = 3  # times in a row that worker processes may die without a frame in between
-_AHEAD = 2  # frames a worker has waiting
+_CRASHES = 3  # consecutive deaths of worker processes, without a frame in between, that end the run
+_AHEAD = 2  # frames queued per worker
 
 Address = tuple[int, int]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameJob:
-    """Everything that a process needs to render frames, ready to be pickled.
+    """Input of a process that renders frames; it can be pickled.
 
     Attributes:
         root: Dataset folder.
-        config: Recipe.
-        meshes: Objects by id.
+        config: Configuration.
+        meshes: Meshes by object id.
         assets: Photographs, panoramas, occluder meshes.
-        plan: Which images.
-        depth_scale: Millimetres for one step of the depth images.
+        plan: Images of the dataset.
+        depth_scale: Millimetres per step of the depth images.
         threads: Threads of a Blender engine, 0 for all cores.
     """
 
@@ -71,12 +71,12 @@ class FrameJob:
 
     @property
     def image_format(self) -> str:
-        """Extension of the colour images."""
+        """File extension of the colour images."""
         return "jpg" if self.plan.split in _JPG_SPLITS else "png"
 
 
 class FrameRenderer:
-    """Renders frames of a job and writes their files, with engines that are kept between them."""
+    """Renders frames of a job and writes their files; the engines live as long as the renderer."""
 
     def __init__(self, job: FrameJob) -> None:
         self._job = job
@@ -86,7 +86,7 @@ class FrameRenderer:
         )
 
     def write(self, scene_id: int, im_id: int) -> FrameEntry:
-        """Render one frame; only its entry is left to be committed."""
+        """Render a frame and write its files; the caller commits the returned entry."""
         job, frame = self._job, self._maker.frame(scene_id, im_id)
         files = FrameFiles(
             scene_path=scene_folder(job.root, job.plan.split, scene_id),
@@ -98,7 +98,7 @@ class FrameRenderer:
             frame.rgb,
             frame.depth_m,
             self._maker.camera,
-            frame.truths,
+            frame.gts,
             frame.masks,
             frame.masks_visib,
             mask_origin_px=frame.mask_origin_px,
@@ -121,26 +121,26 @@ def write_dataset(
     workers: int = 1,
     on_frame: Callable[[int, int], None] = lambda scene_id, im_id: None,
 ) -> None:
-    """Render a BOP dataset; a folder that holds some of its frames already is continued.
+    """Render a BOP dataset; a folder with a part of its frames is continued.
 
     Frames follow the same configuration as training pairs (camera, distance, lights, occluders, backgrounds) but no
-    frame is a scene of a pair. The bytes do not depend on the number of workers, nor on how often it was stopped.
+    frame is a scene of a pair. The bytes depend neither on the number of workers nor on interruptions.
 
     Args:
         root: Dataset folder.
-        config: Recipe; its patch and hypothesis settings are without effect.
-        meshes: Objects by id.
-        plan: Which images.
+        config: Configuration; its patch and hypothesis settings are without effect.
+        meshes: Meshes by object id.
+        plan: Images of the dataset.
         assets: Photographs, panoramas, occluder meshes.
         infos: Symmetries for models_info.json.
-        workers: Processes that render; 1 renders in this one.
-        on_frame: Called with scene and image id of every frame that is on disk.
+        workers: Number of processes that render; 1 renders in this process.
+        on_frame: Called with scene and image id of every frame on disk.
 
     Raises:
-        ConfigError: A scene cannot be drawn, or an image is to show more objects than there are.
-        DatasetError: The folder holds something else.
+        ConfigError: No acceptable scene exists, or `frames.objects` exceeds the number of objects.
+        DatasetError: The folder holds another dataset or other files.
         StorageError: The folder cannot be written, or another process writes it.
-        RenderError: An engine cannot start, or worker processes keep dying.
+        RenderError: An engine cannot start, or worker processes die repeatedly.
     """
     folder, assets = Path(root), assets or Assets()
     fewest, instances = config.frames.objects[0], config.frames.instances
@@ -175,9 +175,9 @@ Rendered = Callable[[Iterable[Address]], Iterator[tuple[Address, FrameEntry]]]
 
 
 def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, int], None]) -> None:
-    """Render what is missing; a scene's JSON files are written with its last frame, or when the run ends early."""
+    """Render the missing frames; a scene's JSON files are written with its last frame, or when the run ends early."""
     writers: dict[int, BopWriter] = {}
-    left: dict[int, int] = {}
+    remaining: dict[int, int] = {}
 
     def missing() -> Iterator[Address]:
         for scene_id, count in job.plan.scenes():
@@ -189,7 +189,7 @@ def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, in
                 on_frame(scene_id, im_id)
             addresses = [(scene_id, im_id) for im_id in range(count) if im_id not in done]
             if addresses:
-                writers[scene_id], left[scene_id] = writer, len(addresses)
+                writers[scene_id], remaining[scene_id] = writer, len(addresses)
                 yield from addresses
             else:
                 writer.close()
@@ -197,8 +197,8 @@ def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, in
     try:
         for (scene_id, im_id), entry in rendered(missing()):
             writers[scene_id].commit(im_id, entry)
-            left[scene_id] -= 1
-            if not left[scene_id]:
+            remaining[scene_id] -= 1
+            if not remaining[scene_id]:
                 writers.pop(scene_id).close()
             on_frame(scene_id, im_id)
     finally:
@@ -208,12 +208,12 @@ def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, in
 
 @contextmanager
 def _rendering(job: FrameJob, workers: int) -> Iterator[Rendered]:
-    """A function that renders frames and yields them as they are done."""
+    """A function that renders frames and yields each entry when its frame is complete."""
     if workers > 1:
         with Pool(job, workers) as pool:
             yield pool.rendered
         return
-    renderer: list[FrameRenderer] = []  # made at the first frame: a dataset that is complete needs none
+    renderer: list[FrameRenderer] = []  # made at the first frame, because a complete dataset needs none
 
     def rendered(addresses: Iterable[Address]) -> Iterator[tuple[Address, FrameEntry]]:
         for address in addresses:
@@ -224,8 +224,8 @@ def _rendering(job: FrameJob, workers: int) -> Iterator[Rendered]:
     try:
         yield rendered
     finally:
-        for made in renderer:
-            made.close()
+        for instance in renderer:
+            instance.close()
 
 
 class Pool:
@@ -308,7 +308,7 @@ class Pool:
 
 
 class _Worker:
-    """What a worker process holds: the job, and its renderer from the first frame on."""
+    """State of a worker process: the job, and the renderer from the first frame on."""
 
     job: FrameJob
     renderer: FrameRenderer | None = None
@@ -326,11 +326,11 @@ def _write(scene_id: int, im_id: int) -> FrameEntry:
     return _Worker.renderer.write(scene_id, im_id)
 
 
-def _depth_scale(config: SynthConfig, targets: Iterable[Target]) -> float:
-    """0.1 mm, BOP's usual step, unless something may lie farther than 16 bits reach with it."""
+def _depth_scale(config: SynthConfig, targets: Iterable[TargetObject]) -> float:
+    """Depth step in millimetres: 0.1 (BOP's default), or 1 where depths may exceed 16 bits of 0.1 mm."""
     farthest_m = max(t.distance_m[1] + t.reach_m for t in targets)
     extent = max(t.distance_m[1] for t in targets) * (config.frames.objects[1] > 1)
-    return 0.1 if farthest_m + extent < 0.1e-3 * _FARTHEST_STEP else 1.0
+    return 0.1 if farthest_m + extent < 0.1e-3 * _MAX_DEPTH_STEP else 1.0
 
 
 def _targets(folder: Path, config: SynthConfig, plan: FramePlan) -> list[Any]:
@@ -342,13 +342,13 @@ def _targets(folder: Path, config: SynthConfig, plan: FramePlan) -> list[Any]:
 
 
 def _sweep(folder: Path) -> None:
-    """Remove what writes left behind that a kill cut short."""
+    """Remove temporary files of interrupted writes."""
     for leftover in folder.rglob(".*.tmp"):
         leftover.unlink(missing_ok=True)
 
 
 def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], plan: FramePlan, assets: Assets) -> None:
-    """Write what the dataset is, or check that the folder holds this very dataset."""
+    """Write the dataset's card, or check that the folder has the same card."""
     card: dict[str, Any] = {
         **asdict(plan),
         **assets.card(),

@@ -1,4 +1,4 @@
-"""Configuration of pairs that are cut out of annotated images."""
+"""Configuration of training pairs cropped from annotated images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,25 +13,27 @@ from synthgen.config.renamed_keys import refuse_renamed
 
 @dataclass(frozen=True, kw_only=True)
 class CutConfig:
-    """How pairs are cut out of annotated images; with the images it decides every byte.
+    """Crops of annotated images; with the images, this configuration decides every byte.
 
     Attributes:
-        seed: Of hypotheses.
+        seed: Seed of the hypotheses.
         patch_px: Side of the patches.
         contour_points: Contour points per silhouette.
-        hypotheses_per_pose: Drawn around each annotated pose; without effect on hypotheses from a file.
+        hypotheses_per_pose: Hypotheses drawn around each annotated pose; without effect on hypotheses from a file.
         shard_size: Pairs in a shard.
-        min_visible: Annotated poses that are visible by less are left out, and those whose box the image shows less of.
-        min_area_px: So are pairs of which the convex hull of one silhouette covers fewer pixels of image or patch.
-        images: Most images to cut, evenly spread over those that are there; 0 cuts all.
-        images_per_scene: So many images of a BOP scene, one after the other, count as one scene (training holds out
-            whole ones). 0: all of them where there are several BOP scenes, else each by itself.
-        window: `diameter` follows the hypothesis' distance and shows every pose as large, for networks whose own window
-            does so; `fixed` is the paper's, of one side for all poses of an object.
-        scale: Side of a diameter window over the projected diameter. Larger than the network's own, which is cut out
-            of it around other hypotheses.
-        padding: Added to an object's largest silhouette box at its nearest pose, as a share of it: its fixed window.
-        perturbation: How far drawn hypotheses lie from the truth.
+        min_visible: Smallest visible fraction of an annotated pose, and smallest fraction of its box inside the image;
+            other poses are left out.
+        min_area_px: Smallest area of the convex hull of either silhouette, in image pixels and in patch pixels; other
+            pairs are left out.
+        images: Maximum number of images, evenly spaced over the dataset; 0 takes all.
+        images_per_scene: Consecutive images of a BOP scene that count as one scene (training holds out whole scenes).
+            0 takes the BOP scenes, or single images where there is only one BOP scene.
+        window: `diameter` scales with the hypothesis' distance, so that the object has the same size in every patch, as
+            for networks with such a window; `fixed` is the paper's, with one side for all poses of an object.
+        scale: Side of a diameter window over the projected diameter. Larger than the network's own window, which is
+            cropped from the patch around other hypotheses.
+        padding: Margin of the fixed window, as a fraction of the object's largest silhouette box at its nearest pose.
+        perturbation: Distance of drawn hypotheses from the ground truth.
     """
 
     seed: int = 0

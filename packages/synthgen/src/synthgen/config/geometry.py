@@ -1,4 +1,4 @@
-"""Where the camera, the object, the hypotheses and the window are."""
+"""Geometry: camera, object distance and viewpoint, hypotheses, window."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -27,7 +27,7 @@ class CameraConfig:
         check("fy", self.fy, 1.0)
 
     def camera(self) -> Camera:
-        """The camera as posecore knows it."""
+        """The pinhole camera."""
         return Camera(
             K=intrinsics(self.fx, self.fy, self.cx, self.cy), width_px=self.width_px, height_px=self.height_px
         )
@@ -38,9 +38,9 @@ class DistanceConfig:
     """Camera z of the object's box centre.
 
     Attributes:
-        unit: 'diameter' scales with the object, 'm' is absolute.
-        min: Smallest distance in that unit; it also decides the window's side.
-        max: Largest distance in that unit.
+        unit: `diameter` scales with the object, `m` is absolute.
+        min: Smallest distance, in `unit`; it also decides the window's side.
+        max: Largest distance, in `unit`.
     """
 
     unit: Literal["diameter", "m"] = "diameter"
@@ -54,7 +54,7 @@ class DistanceConfig:
         """Distance range in metres for an object.
 
         Raises:
-            ConfigError: The nearest distance puts the camera inside the object.
+            ConfigError: At the smallest distance the camera is inside the object.
         """
         factor = diameter_m if self.unit == "diameter" else 1.0
         low, high = self.min * factor, self.max * factor
@@ -68,15 +68,15 @@ class DistanceConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ViewConfig:
-    """From where the object is seen and where in the image it lies.
+    """Viewpoint, and position of the object in the image.
 
     Attributes:
-        viewpoint: 'so3' draws rotations uniformly; 'upright' keeps the object's +z up within `elevation_deg` and
-            `roll_deg`, as for things that stand on a table.
-        elevation_deg: Camera elevation above the object's xy plane, only for 'upright'.
-        roll_deg: In-plane rotation, only for 'upright'.
-        position_jitter: The projected box centre is uniform within this share of the image around its middle.
-        min_inside: Smallest share of the silhouette's box that must lie inside the image.
+        viewpoint: `so3` draws rotations uniformly; `upright` keeps the object's +z up within `elevation_deg` and
+            `roll_deg`, as for objects that stand on a table.
+        elevation_deg: Camera elevation above the object's xy plane, only for `upright`.
+        roll_deg: In-plane rotation, only for `upright`.
+        position_jitter: The projected box centre is uniform within this fraction of the image around its middle.
+        min_inside: Smallest fraction of the silhouette's box inside the image.
     """
 
     viewpoint: Literal["so3", "upright"] = "so3"
@@ -94,14 +94,14 @@ class ViewConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class PerturbationConfig:
-    """How far a hypothesis lies from the truth.
+    """Distance of hypotheses from the ground truth.
 
     Attributes:
-        max_angle_deg: The angle is uniform in 0 to this, about a random axis.
-        max_translation_diameter: The object moves in a random direction, the length uniform in 0 to this.
-        easy_fraction: Share of hypotheses whose two bounds are multiplied by `easy_scale`, so that a refiner also sees
-            starts that are nearly right.
-        easy_scale: That factor.
+        max_angle_deg: Maximum rotation angle; uniform from 0, about a random axis.
+        max_translation_diameter: Maximum translation; uniform from 0, in a random direction.
+        easy_fraction: Fraction of hypotheses whose two bounds are multiplied by `easy_scale`, so that a refiner is also
+            trained on nearly correct initial poses.
+        easy_scale: Factor on both bounds of easy hypotheses.
     """
 
     max_angle_deg: float = 40.0
@@ -117,14 +117,14 @@ class PerturbationConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WindowConfig:
+class FixedWindowConfig:
     """The fixed square window of an object.
 
     Attributes:
-        padding: Added to the largest silhouette box at the smallest distance, as a share of it.
-        shared: Whether all objects have the window of the one that needs the largest, as in datasets of a category,
-            whose members stand for objects that nobody has seen.
-        min_area_px: A silhouette with fewer patch pixels rejects the draw.
+        padding: Margin, as a fraction of the largest silhouette box at the smallest distance.
+        shared: Whether all objects have the largest object's window, as in datasets of a category, whose members stand
+            for unseen objects.
+        min_area_px: Smallest silhouette area in patch pixels; draws below it are rejected.
     """
 
     padding: float = 0.3

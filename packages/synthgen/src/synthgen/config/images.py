@@ -1,4 +1,4 @@
-"""Whole images: frames and sequences of BOP datasets."""
+"""Whole images of BOP datasets: single frames and sequences."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,10 +12,10 @@ class FrameConfig:
 
     Attributes:
         objects: Number of labelled objects in an image.
-        instances: How often one object may be among them.
-        gap_diameter: Room between two that lie together, in diameters of the one that is added.
-        lights: 'lamps' are those of training pairs; 'ceiling' is a large lamp overhead and a small one around.
-        min_target_visible: Visible share from which an object is to be found (BOP's targets).
+        instances: Maximum number of instances of an object in an image.
+        gap_diameter: Clearance between adjacent objects, in diameters of the added object.
+        lights: `lamps` are those of training pairs; `ceiling` is a large lamp overhead and a small lamp at any side.
+        min_target_visible: Smallest visible fraction of an object in the list of targets (BOP's).
     """
 
     objects: IntRange = (1, 1)
@@ -33,16 +33,16 @@ class FrameConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SequenceConfig:
-    """Motion of tracking sequences: how the first object moves as the camera sees it.
+    """Motion of tracking sequences. Speeds are those of the first object in the camera frame.
 
     Attributes:
-        fps: Images a second.
-        max_angular_speed_deg_s: Bound on its angular speed.
-        max_speed_diameter_s: Bound on its box centre's speed.
-        min_period_s: Nothing swings faster than with this period.
-        occluder_period_s: A shape passes before it once in every such span; 0 for never.
-        light_variation: Largest change of a lamp's strength either way, as a share.
-        shutter: Share of the time between two images that the shutter is open: what motion blur covers.
+        fps: Images per second.
+        max_angular_speed_deg_s: Maximum angular speed.
+        max_speed_diameter_s: Maximum speed of the box centre.
+        min_period_s: Shortest period of any motion.
+        occluder_period_s: Time in which an occluder crosses in front of the object once; 0 for none.
+        light_variation: Largest change of a lamp's strength either way, as a fraction.
+        shutter: Exposure time (motion blur) as a fraction of the time between two images.
     """
 
     fps: float = 30.0

@@ -1,4 +1,4 @@
-"""The whole recipe of a dataset, and how it is put together from presets and overrides."""
+"""The whole configuration of a dataset, resolved from presets and overrides."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,7 +9,7 @@ from posecore import config as config_tools
 from posecore.errors import ConfigError
 from posecore.files import data_spec
 
-from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
+from synthgen.config.geometry import CameraConfig, DistanceConfig, FixedWindowConfig, PerturbationConfig, ViewConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.ranges import MAX_PATCH_PX, check
 from synthgen.config.renamed_keys import refuse_renamed
@@ -27,29 +27,29 @@ from synthgen.engine import Device, EngineName
 
 @dataclass(frozen=True, kw_only=True)
 class SynthConfig:
-    """A dataset's whole recipe; with the object and the number of samples it decides every byte.
+    """A dataset's whole configuration; with the objects and the number of samples it decides every byte.
 
     Attributes:
         seed: Dataset seed.
         engine: Renderer of the scenes.
-        hypothesis_engine: Renderer of the hypothesis patches; the rasteriser is what inference uses.
-        device: Where Cycles traces.
+        hypothesis_engine: Renderer of the hypothesis patches; inference uses the rasteriser.
+        device: Device of Cycles.
         samples: Light paths per pixel of the Blender engines.
         patch_px: Side of the patches.
         contour_points: Contour points per silhouette.
-        hypotheses_per_scene: Hypotheses that share one rendered scene.
-        shard_size: Samples in a shard: the unit of work and of resuming. A multiple of `hypotheses_per_scene`.
+        hypotheses_per_scene: Hypotheses per rendered scene.
+        shard_size: Samples in a shard, the unit of work and of resuming. A multiple of `hypotheses_per_scene`.
         camera: Intrinsics.
         distance: Distance of the object.
-        view: Viewpoint and place in the image.
-        perturbation: Distance of the hypotheses from the truth.
+        view: Viewpoint and position in the image.
+        perturbation: Distance of the hypotheses from the ground truth.
         window: Fixed window.
         scene: Kinds of scene.
-        tabletop: Scenes on a table.
-        lights: Lamps.
-        material: The object's surface.
-        occluders: Shapes around it.
-        background: What lies behind.
+        tabletop: Tabletop scenes.
+        lights: Lighting.
+        material: Surface of the object.
+        occluders: Occluders and props.
+        background: Background.
         sensor: Camera effects.
         frames: Whole camera images.
         sequence: Motion of tracking sequences.
@@ -68,7 +68,7 @@ class SynthConfig:
     distance: DistanceConfig = field(default_factory=DistanceConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
+    window: FixedWindowConfig = field(default_factory=FixedWindowConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     tabletop: TabletopConfig = field(default_factory=TabletopConfig)
     lights: LightConfig = field(default_factory=LightConfig)
@@ -90,7 +90,7 @@ class SynthConfig:
             near = max(1, round(self.shard_size / self.hypotheses_per_scene)) * self.hypotheses_per_scene
             raise ConfigError(
                 f"shard_size is {self.shard_size}, expected a multiple of hypotheses_per_scene "
-                f"({self.hypotheses_per_scene}) because a scene lives in one shard; try shard_size={near}"
+                f"({self.hypotheses_per_scene}) because a scene is in one shard; try shard_size={near}"
             )
 
 

@@ -1,4 +1,4 @@
-"""What is around the object: tables, light, occluders, backgrounds; and its surface and the camera's effects."""
+"""Scene around the object (table, light, occluders, background), its material, and camera effects."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,12 +10,12 @@ from synthgen.config.ranges import IntRange, Range, check, check_range
 
 @dataclass(frozen=True, kw_only=True)
 class SceneConfig:
-    """Which kinds of scene.
+    """Kinds of scene.
 
     Attributes:
-        kind: 'cutout' has the object in mid air over a background, with shapes floating around it; 'tabletop' has it on
-            or near a textured plane, among things that lie there; 'mixed' draws one of the two for each scene.
-        tabletop_fraction: Share of tabletop scenes, only for 'mixed'.
+        kind: `cutout` has the object in mid air over a background, with occluders floating around it; `tabletop` has it
+            on or above a textured plane, among distractors; `mixed` draws one of the two for each scene.
+        tabletop_fraction: Fraction of tabletop scenes, only for `mixed`.
     """
 
     kind: Literal["cutout", "tabletop", "mixed"] = "cutout"
@@ -27,18 +27,17 @@ class SceneConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TabletopConfig:
-    """Scenes of kind 'tabletop'. In-plane rotation is `view.roll_deg`; `view.viewpoint` 'upright' rests with +z up.
+    """Scenes of kind `tabletop`. In-plane rotation is `view.roll_deg`; `view.viewpoint: upright` rests with +z up.
 
     Attributes:
         elevation_deg: Camera elevation above the table, uniform on the sphere's zone.
-        near_fraction: Share of scenes with the object in any orientation, its lowest point above the table by
-            `hover_diameter`, instead of at rest.
-        hover_diameter: Height of that lowest point; 0 touches.
-        tables: Number of different tables made for a dataset.
-        size_diameter: Sides of a table, uniform in the logarithm; in units of 0.1 m doubled or halved to come nearest
-            to the object's diameter, so that objects of about one size share their tables.
-        distractors: Number of other things on the table.
-        gap_diameter: Clearance between the circles around two things on the table.
+        near_fraction: Fraction of scenes with the object above the table in any orientation, not at rest.
+        hover_diameter: Height of its lowest point in these scenes; 0 touches.
+        tables: Number of different tables in a dataset.
+        size_diameter: Sides of a table, log-uniform; in units of 0.1 m times the power of two nearest to the object's
+            diameter, so that objects of about the same size share their tables.
+        distractors: Number of distractors on the table.
+        gap_diameter: Clearance between the footprint circles of two objects on the table.
     """
 
     elevation_deg: Range = (20.0, 80.0)
@@ -61,17 +60,17 @@ class TabletopConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class LightConfig:
-    """Lamps around the object.
+    """Lighting.
 
     Attributes:
-        hdri_fraction: Share of scenes lit by a panorama instead of lamps, where a folder of panoramas is given; its
-            brightness is drawn from `brightness`, its turn about the vertical uniformly.
+        hdri_fraction: Fraction of scenes lit by a panorama instead of lamps, where a folder of panoramas is given; its
+            brightness is drawn from `brightness`, its rotation about the vertical uniformly.
         count: Number of lamps.
-        brightness: Linear radiance of a white surface that faces all the light, drawn uniformly in its logarithm.
-        ambient_fraction: Share of it that comes evenly from all around.
-        colour: How far a lamp's colour may leave white, 0 to 1.
+        brightness: Linear radiance of a white surface that faces all lamps, log-uniform.
+        ambient_fraction: Fraction of the brightness that is ambient light.
+        colour: Largest departure of a lamp's colour from white, 0 to 1.
         distance_diameter: Distance of the lamps from the object.
-        size: A lamp's size as a share of its distance; small is hard shadows.
+        size: Size of a lamp as a fraction of its distance; small lamps cast hard shadows.
     """
 
     hdri_fraction: float = 0.5
@@ -94,12 +93,12 @@ class LightConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class MaterialConfig:
-    """Variation of the target's surface around its own colours.
+    """Variation of the target object's material around the mesh's colours.
 
     Attributes:
-        textureless_fraction: Share of scenes in which the object has its mean colour all over.
-        random_colour_fraction: Fraction of scenes in which its colours are random: half are plain, half have a
-            procedural texture of two colours.
+        textureless_fraction: Fraction of scenes with the object's mean colour all over.
+        random_colour_fraction: Fraction of scenes with random colours: half of them plain, half a procedural texture
+            of two colours.
         hue_shift: Largest hue rotation in turns, either way.
         saturation: Factor on the saturation.
         value: Factor on the brightness.
@@ -132,15 +131,15 @@ class OccluderConfig:
     """Shapes in front of, beside and behind the object: primitives, or the meshes of a folder.
 
     Attributes:
-        library: Number of different shapes made for a dataset; of a folder's meshes at most this many are used.
-        scale: 'fit' gives a folder's meshes `size_diameter`, 'own' leaves them at their own size.
+        library: Number of different shapes in a dataset; the maximum where a folder of meshes is given.
+        scale: `fit` scales a folder's meshes to `size_diameter`, `own` keeps their size.
         size_diameter: Diameter of a shape.
-        front: Number of shapes that may hide the object.
+        front: Number of shapes in front of the object.
         props: Number of shapes around it, in cutout scenes.
-        visible_fraction: Wanted visible share of the object, uniform in this range: shapes in front are slid in, and up
-            to four are added, until it is met. Nothing (null) leaves it to where the shapes happen to be. Without
-            effect where `front` allows none.
-        min_visible: Smallest visible share of the object; a scene below it is drawn again.
+        visible_fraction: Visible fraction of the object to reach, uniform in this range: the shapes in front are moved
+            in, and up to four are added. Null keeps the shapes where they are drawn. Without effect where `front`
+            allows none.
+        min_visible: Smallest visible fraction of the object; a scene below it is drawn again.
     """
 
     library: int = 32
@@ -168,12 +167,12 @@ class OccluderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class BackgroundConfig:
-    """What lies behind.
+    """Background of the scenes.
 
     Attributes:
-        hdri_fraction: Share of the scenes lit by a panorama that show it as well.
-        photo_fraction: Share of the other scenes over a photograph where a folder of photographs is given; the rest is
-            drawn.
+        hdri_fraction: Fraction of the scenes lit by a panorama that also show it as background.
+        photo_fraction: Fraction of the other scenes with a photograph as background, where a folder of photographs is
+            given; the others have a procedural background.
     """
 
     hdri_fraction: float = 0.5
@@ -189,14 +188,14 @@ class SensorConfig:
     """Camera effects.
 
     Attributes:
-        exposure_ev: Stops.
+        exposure_ev: Exposure in stops.
         white_balance: Standard deviation of the log gain of a channel.
-        noise_sigma: Noise in display units [0, 1].
-        blur_sigma_px: Defocus.
+        noise_sigma: Standard deviation of the noise in display units [0, 1].
+        blur_sigma_px: Standard deviation of the defocus.
         motion_px: Length of straight motion blur.
-        motion_fraction: Share of scenes with motion blur.
-        jpeg_quality: Quality range.
-        jpeg_fraction: Share of scenes that go through JPEG.
+        motion_fraction: Fraction of scenes with motion blur.
+        jpeg_quality: JPEG quality.
+        jpeg_fraction: Fraction of scenes with JPEG compression.
     """
 
     exposure_ev: Range = (-0.5, 0.5)

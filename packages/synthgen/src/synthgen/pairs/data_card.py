@@ -14,7 +14,7 @@ from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import Mesh
 
 from synthgen.config import SynthConfig
-from synthgen.draw.target import Target, make_targets
+from synthgen.draw.target import TargetObject, make_targets
 from synthgen.inputs.assets import Assets
 
 # What decides the bytes of a sample beside the project itself.
@@ -60,7 +60,7 @@ def make_card(config: SynthConfig, n: int, meshes: Mapping[int, Mesh], assets: A
     }
 
 
-def depth_step_m(targets: Sequence[Target]) -> float:
+def depth_step_m(targets: Sequence[TargetObject]) -> float:
     """Step that depth is stored in: 0.1 mm, doubled until the deepest scene of the largest object fits."""
     deepest_m = max(t.distance_m[1] + t.reach_m for t in targets)
     step_m = FINEST_DEPTH_STEP_M
