@@ -71,7 +71,11 @@ def test_programs_never_import_each_other(package: str) -> None:
 
 
 def test_posecore_stands_on_its_own() -> None:
-    assert offences("posecore", {"torch", "bpy", "mathutils", "click", "rich", *PROGRAMS}) == []
+    assert offences("posecore", {"torch", "bpy", "mathutils", *PROGRAMS}) == []
+    with_extra = {"packages/posecore/src/posecore/command_line.py"}
+    assert {line.partition(":")[0] for line in offences("posecore", {"click", "rich"})} == with_extra
+    users = [file for file in sources("posecore") if "command_line" in file.read_text()]
+    assert users == []
 
 
 def test_blender_stays_in_one_folder() -> None:
@@ -125,7 +129,7 @@ def test_package_ships_licence_readme_and_the_common_version(package: str) -> No
     }
     assert versions == {project["version"]}
     own = [name for name in project["dependencies"] if name.startswith("posecore")]
-    assert own == ([] if package == "posecore" else [f"posecore=={project['version']}"])
+    assert own == ([] if package == "posecore" else [f"posecore[cli]=={project['version']}"])
 
 
 def test_data_specs_are_one_folder() -> None:
