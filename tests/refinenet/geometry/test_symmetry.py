@@ -138,4 +138,5 @@ def test_torch_and_numpy_have_one_definition(mesh, name):
     np.testing.assert_allclose(by_angle, nearest_symmetric(T_gt, T, info), atol=1e-6)
     by_points, _ = symmetry.nearest_by_points(torch.from_numpy(T), torch.from_numpy(T_gt), rows, objects)
     points_m = objects.points_m[0].numpy()
-    np.testing.assert_allclose(by_points, nearest_symmetric(T_gt, T, info, by="points", points_m=points_m), atol=1e-5)
+    reference = nearest_symmetric(T_gt, T, info, by="points", points_m=points_m)
+    np.testing.assert_allclose(by_points, reference, atol=1e-3 if name == "ball" else 1e-5)  # a ball's axes by sweeps
