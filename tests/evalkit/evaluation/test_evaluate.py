@@ -245,7 +245,7 @@ def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
     block = {"perturbation": {"rows": rows}}
     in_order = pair_up(dataset, in_memory([truth] * 3, block)).pairs
     assert [pair.level.angle_deg for pair in in_order] == [5.0, 10.0, 20.0]
-    two = pair_up(dataset, in_memory([truth] * 2, block | {"start_lines": [4, 2]})).pairs
+    two = pair_up(dataset, in_memory([truth] * 2, block | {"initial_lines": [4, 2]})).pairs
     assert [pair.estimate is None for pair in two] == [False, True, False]
     with pytest.raises(ResultFileError, match="2 estimates of object 1 in scene 4, image 0, but 3 starts"):
         pair_up(dataset, in_memory([truth] * 2, block))

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from evalkit.cli.group import CleanGroup
 from evalkit.cli.tracking import tracking
 from evalkit.inputs.result_files import load_result_files
 from evalkit.tracking import frames_of, track_scores, tracks_of
@@ -13,13 +12,14 @@ from posecore import se3
 from posecore.bop import BopDataset, BopWriter, Estimate, GroundTruth, write_models, write_results, write_targets
 from posecore.bop.annotations import Target
 from posecore.camera import Camera
+from posecore.command_line import ErrorReportingGroup
 from posecore.errors import ResultFileError
 from posecore.mesh import load_mesh
 
 TUG, BOBBIN = 1, 5
 FRAMES = tuple(range(10, 30, 2))  # ten frames with gaps in their numbers, which are no gaps in time
 CAMERA = Camera(K=np.array([[100.0, 0, 16], [0, 100, 12], [0, 0, 1]]), width_px=32, height_px=24)
-GROUP = CleanGroup(commands={"tracking": tracking})
+GROUP = ErrorReportingGroup(commands={"tracking": tracking})
 
 
 def pose(frame, x_m):

@@ -15,6 +15,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from synthgen.bop import dataset_writer
 from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import load_config

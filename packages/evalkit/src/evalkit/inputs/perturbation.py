@@ -12,7 +12,7 @@ from posecore.errors import ConfigError
 
 from evalkit import __version__
 from evalkit.inputs.pairing import Level, truths_of
-from evalkit.inputs.result_files import START_METHOD
+from evalkit.inputs.result_files import INITIAL_METHOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ def perturb_dataset(
     sidecar = {
         "dataset": str(dataset.root.resolve()),
         "split": dataset.split,
-        "method": START_METHOD,
+        "method": INITIAL_METHOD,
         "settings": {"seed": seed, "depth_stretch": depth_stretch, "evalkit": __version__},
         "perturbation": ({} if protocol is None else {"protocol": protocol}) | {"rows": rows},
     }
