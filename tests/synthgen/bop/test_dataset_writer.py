@@ -298,7 +298,6 @@ def test_the_pbr_preset_shows_many_objects_on_a_table(tmp_path, meshes):
 
 
 def test_depth_steps_grow_for_far_scenes(config_of, meshes):
-    from synthgen.bop import dataset_writer
     from synthgen.draw.target import make_targets
 
     for overrides, scale in (((), 0.1), (("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0)):

@@ -8,7 +8,7 @@ from synthgen.config.cut import CutConfig, load_cut_config
 from synthgen.config.geometry import CameraConfig, DistanceConfig, FixedWindowConfig, PerturbationConfig, ViewConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.recipe import SynthConfig, load_config, preset_names
-from synthgen.config.renamed_keys import RENAMED_KEYS, migrate, refuse_renamed
+from synthgen.config.renamed_keys import RENAMED_KEYS, migrate
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -41,5 +41,4 @@ __all__ = [
     "load_cut_config",
     "migrate",
     "preset_names",
-    "refuse_renamed",
 ]

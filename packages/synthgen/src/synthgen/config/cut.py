@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from posecore import config as config_tools
+from posecore.config import Range, check_ranges
+from posecore.renamed import refuse_renamed_keys
 
-from synthgen.config.geometry import PerturbationConfig
-from synthgen.config.ranges import MAX_PATCH_PX, check
-from synthgen.config.renamed_keys import refuse_renamed
+from synthgen.config.geometry import MAX_PATCH_PX, PerturbationConfig
+from synthgen.config.renamed_keys import RENAMED_KEYS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,32 +37,22 @@ class CutConfig:
         perturbation: Distance of drawn hypotheses from the ground truth.
     """
 
-    seed: int = 0
-    patch_px: int = 224
-    contour_points: int = 100
-    hypotheses_per_pose: int = 8
-    shard_size: int = 64
-    min_visible: float = 0.1
-    min_area_px: float = 150.0
-    images: int = 0
-    images_per_scene: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    patch_px: Annotated[int, Range(16, MAX_PATCH_PX)] = 224
+    contour_points: Annotated[int, Range(1, 100_000)] = 100
+    hypotheses_per_pose: Annotated[int, Range(1, 4096)] = 8
+    shard_size: Annotated[int, Range(1, 1_000_000)] = 64
+    min_visible: Annotated[float, Range(0, 1)] = 0.1
+    min_area_px: Annotated[float, Range(1)] = 150.0
+    images: Annotated[int, Range(0)] = 0
+    images_per_scene: Annotated[int, Range(0)] = 0
     window: Literal["diameter", "fixed"] = "diameter"
-    scale: float = 2.0
-    padding: float = 0.3
+    scale: Annotated[float, Range(1, 8)] = 2.0
+    padding: Annotated[float, Range(0, 4)] = 0.3
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
 
     def __post_init__(self) -> None:
-        check("seed", self.seed, 0, 2**63 - 1)
-        check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
-        check("contour_points", self.contour_points, 1, 100_000)
-        check("hypotheses_per_pose", self.hypotheses_per_pose, 1, 4096)
-        check("shard_size", self.shard_size, 1, 1_000_000)
-        check("min_visible", self.min_visible, 0.0, 1.0)
-        check("min_area_px", self.min_area_px, 1.0)
-        check("images", self.images, 0)
-        check("images_per_scene", self.images_per_scene, 0)
-        check("scale", self.scale, 1.0, 8.0)
-        check("padding", self.padding, 0.0, 4.0)
+        check_ranges(self)
 
 
 def load_cut_config(overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None) -> CutConfig:
@@ -75,6 +66,6 @@ def load_cut_config(overrides: Sequence[str] = (), values: Mapping[str, Any] | N
         ConfigError: Unknown key or value, or a key with a new name; the message names it.
     """
     mapping = config_tools.apply_overrides({}, overrides)
-    refuse_renamed(mapping, "--set")
+    refuse_renamed_keys(mapping, RENAMED_KEYS, "--set")
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
     return config_tools.build(CutConfig, mapping, "settings")

@@ -3,16 +3,24 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from posecore import config as config_tools
+from posecore.config import Range, check_ranges
 from posecore.errors import ConfigError
 from posecore.files import data_spec
+from posecore.renamed import refuse_renamed_keys
 
-from synthgen.config.geometry import CameraConfig, DistanceConfig, FixedWindowConfig, PerturbationConfig, ViewConfig
+from synthgen.config.geometry import (
+    MAX_PATCH_PX,
+    CameraConfig,
+    DistanceConfig,
+    FixedWindowConfig,
+    PerturbationConfig,
+    ViewConfig,
+)
 from synthgen.config.images import FrameConfig, SequenceConfig
-from synthgen.config.ranges import MAX_PATCH_PX, check
-from synthgen.config.renamed_keys import refuse_renamed
+from synthgen.config.renamed_keys import RENAMED_KEYS
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -55,15 +63,15 @@ class SynthConfig:
         sequence: Motion of tracking sequences.
     """
 
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     engine: EngineName = "cycles"
     hypothesis_engine: EngineName = "raster"
     device: Device = "cpu"
-    samples: int = 16
-    patch_px: int = 224
-    contour_points: int = 100
-    hypotheses_per_scene: int = 8
-    shard_size: int = 64
+    samples: Annotated[int, Range(1, 65536)] = 16
+    patch_px: Annotated[int, Range(16, MAX_PATCH_PX)] = 224
+    contour_points: Annotated[int, Range(1, 100_000)] = 100
+    hypotheses_per_scene: Annotated[int, Range(1, 4096)] = 8
+    shard_size: Annotated[int, Range(1, 1_000_000)] = 64
     camera: CameraConfig = field(default_factory=CameraConfig)
     distance: DistanceConfig = field(default_factory=DistanceConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
@@ -80,12 +88,7 @@ class SynthConfig:
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
 
     def __post_init__(self) -> None:
-        check("seed", self.seed, 0, 2**63 - 1)
-        check("samples", self.samples, 1, 65536)
-        check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
-        check("contour_points", self.contour_points, 1, 100_000)
-        check("hypotheses_per_scene", self.hypotheses_per_scene, 1, 4096)
-        check("shard_size", self.shard_size, 1, 1_000_000)
+        check_ranges(self)
         if self.shard_size % self.hypotheses_per_scene:
             near = max(1, round(self.shard_size / self.hypotheses_per_scene)) * self.hypotheses_per_scene
             raise ConfigError(
@@ -120,8 +123,7 @@ def load_config(
         raise ConfigError(
             f"--preset {preset}: there is no such preset; choose one of {', '.join(preset_names())} or a .yaml file"
         )
-    refuse_renamed(mapping, where)
-    refuse_renamed(config_tools.apply_overrides({}, overrides), "--set")
+    refuse_renamed_keys(config_tools.apply_overrides({}, overrides), RENAMED_KEYS, "--set")
     mapping = config_tools.apply_overrides(mapping, overrides)
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
-    return config_tools.build(SynthConfig, mapping, where)
+    return config_tools.build(SynthConfig, mapping, where, RENAMED_KEYS)

@@ -1,11 +1,10 @@
 """Scene around the object (table, light, occluders, background), its material, and camera effects."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
+from posecore.config import Range, check_ranges
 from posecore.errors import ConfigError
-
-from synthgen.config.ranges import IntRange, Range, check, check_range
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -19,10 +18,10 @@ class SceneConfig:
     """
 
     kind: Literal["cutout", "tabletop", "mixed"] = "cutout"
-    tabletop_fraction: float = 0.5
+    tabletop_fraction: Annotated[float, Range(0, 1)] = 0.5
 
     def __post_init__(self) -> None:
-        check("tabletop_fraction", self.tabletop_fraction, 0.0, 1.0)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,22 +39,16 @@ class TabletopConfig:
         gap_diameter: Clearance between the footprint circles of two objects on the table.
     """
 
-    elevation_deg: Range = (20.0, 80.0)
-    near_fraction: float = 0.25
-    hover_diameter: Range = (0.0, 0.25)
-    tables: int = 12
-    size_diameter: Range = (4.0, 10.0)
-    distractors: IntRange = (0, 4)
-    gap_diameter: Range = (0.02, 0.8)
+    elevation_deg: Annotated[tuple[float, float], Range(1, 90)] = (20.0, 80.0)
+    near_fraction: Annotated[float, Range(0, 1)] = 0.25
+    hover_diameter: Annotated[tuple[float, float], Range(0, 2)] = (0.0, 0.25)
+    tables: Annotated[int, Range(1, 200)] = 12
+    size_diameter: Annotated[tuple[float, float], Range(2, 40)] = (4.0, 10.0)
+    distractors: Annotated[tuple[int, int], Range(0, 50)] = (0, 4)
+    gap_diameter: Annotated[tuple[float, float], Range(0, 10)] = (0.02, 0.8)
 
     def __post_init__(self) -> None:
-        check_range("elevation_deg", self.elevation_deg, 1.0, 90.0)
-        check("near_fraction", self.near_fraction, 0.0, 1.0)
-        check_range("hover_diameter", self.hover_diameter, 0.0, 2.0)
-        check("tables", self.tables, 1, 200)
-        check_range("size_diameter", self.size_diameter, 2.0, 40.0)
-        check_range("distractors", self.distractors, 0, 50)
-        check_range("gap_diameter", self.gap_diameter, 0.0, 10.0)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,22 +66,16 @@ class LightConfig:
         size: Size of a lamp as a fraction of its distance; small lamps cast hard shadows.
     """
 
-    hdri_fraction: float = 0.5
-    count: IntRange = (1, 3)
-    brightness: Range = (0.5, 1.6)
-    ambient_fraction: Range = (0.15, 0.7)
-    colour: float = 0.35
-    distance_diameter: Range = (2.0, 8.0)
-    size: Range = (0.02, 0.6)
+    hdri_fraction: Annotated[float, Range(0, 1)] = 0.5
+    count: Annotated[tuple[int, int], Range(0, 16)] = (1, 3)
+    brightness: Annotated[tuple[float, float], Range(1e-3, 100)] = (0.5, 1.6)
+    ambient_fraction: Annotated[tuple[float, float], Range(0, 1)] = (0.15, 0.7)
+    colour: Annotated[float, Range(0, 1)] = 0.35
+    distance_diameter: Annotated[tuple[float, float], Range(1)] = (2.0, 8.0)
+    size: Annotated[tuple[float, float], Range(1e-3, 2)] = (0.02, 0.6)
 
     def __post_init__(self) -> None:
-        check("hdri_fraction", self.hdri_fraction, 0.0, 1.0)
-        check_range("count", self.count, 0, 16)
-        check_range("brightness", self.brightness, 1e-3, 100.0)
-        check_range("ambient_fraction", self.ambient_fraction, 0.0, 1.0)
-        check("colour", self.colour, 0.0, 1.0)
-        check_range("distance_diameter", self.distance_diameter, 1.0)
-        check_range("size", self.size, 1e-3, 2.0)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,23 +94,22 @@ class MaterialConfig:
         specular: Principled specular level.
     """
 
-    textureless_fraction: float = 0.0
-    random_colour_fraction: float = 0.0
-    hue_shift: float = 0.04
-    saturation: Range = (0.7, 1.3)
-    value: Range = (0.75, 1.2)
-    roughness: Range = (0.2, 1.0)
-    metallic: Range = (0.0, 0.3)
-    specular: Range = (0.1, 0.7)
+    textureless_fraction: Annotated[float, Range(0, 1)] = 0.0
+    random_colour_fraction: Annotated[float, Range(0, 1)] = 0.0
+    hue_shift: Annotated[float, Range(0, 0.5)] = 0.04
+    saturation: Annotated[tuple[float, float], Range(0, 4)] = (0.7, 1.3)
+    value: Annotated[tuple[float, float], Range(0, 4)] = (0.75, 1.2)
+    roughness: Annotated[tuple[float, float], Range(0, 1)] = (0.2, 1.0)
+    metallic: Annotated[tuple[float, float], Range(0, 1)] = (0.0, 0.3)
+    specular: Annotated[tuple[float, float], Range(0, 1)] = (0.1, 0.7)
 
     def __post_init__(self) -> None:
-        check("textureless_fraction", self.textureless_fraction, 0.0, 1.0)
-        check("random_colour_fraction", self.random_colour_fraction, 0.0, 1.0 - self.textureless_fraction)
-        check("hue_shift", self.hue_shift, 0.0, 0.5)
-        for name in ("saturation", "value"):
-            check_range(name, getattr(self, name), 0.0, 4.0)
-        for name in ("roughness", "metallic", "specular"):
-            check_range(name, getattr(self, name), 0.0, 1.0)
+        check_ranges(self)
+        if self.textureless_fraction + self.random_colour_fraction > 1.0:
+            raise ConfigError(
+                f"textureless_fraction is {self.textureless_fraction} and random_colour_fraction "
+                f"{self.random_colour_fraction}, expected a sum of at most 1"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,27 +128,21 @@ class OccluderConfig:
         min_visible: Smallest visible fraction of the object; a scene below it is drawn again.
     """
 
-    library: int = 32
+    library: Annotated[int, Range(1, 1000)] = 32
     scale: Literal["fit", "own"] = "fit"
-    size_diameter: Range = (0.25, 1.0)
-    front: IntRange = (0, 2)
-    props: IntRange = (0, 3)
-    visible_fraction: Range | None = None
-    min_visible: float = 0.4
+    size_diameter: Annotated[tuple[float, float], Range(0.01, 10)] = (0.25, 1.0)
+    front: Annotated[tuple[int, int], Range(0, 50)] = (0, 2)
+    props: Annotated[tuple[int, int], Range(0, 50)] = (0, 3)
+    visible_fraction: Annotated[tuple[float, float], Range(0, 1)] | None = None
+    min_visible: Annotated[float, Range(0, 1)] = 0.4
 
     def __post_init__(self) -> None:
-        check("library", self.library, 1, 1000)
-        check_range("size_diameter", self.size_diameter, 0.01, 10.0)
-        check_range("front", self.front, 0, 50)
-        check_range("props", self.props, 0, 50)
-        check("min_visible", self.min_visible, 0.0, 1.0)
-        if self.visible_fraction is not None:
-            check_range("visible_fraction", self.visible_fraction, 0.0, 1.0)
-            if self.visible_fraction[0] < self.min_visible:
-                raise ConfigError(
-                    f"visible_fraction starts at {self.visible_fraction[0]}, expected at least min_visible "
-                    f"({self.min_visible}) because scenes below that are rejected; lower min_visible"
-                )
+        check_ranges(self)
+        if self.visible_fraction is not None and self.visible_fraction[0] < self.min_visible:
+            raise ConfigError(
+                f"visible_fraction starts at {self.visible_fraction[0]}, expected at least min_visible "
+                f"({self.min_visible}) because scenes below it are rejected; lower min_visible"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,12 +155,11 @@ class BackgroundConfig:
             given; the others have a procedural background.
     """
 
-    hdri_fraction: float = 0.5
-    photo_fraction: float = 0.7
+    hdri_fraction: Annotated[float, Range(0, 1)] = 0.5
+    photo_fraction: Annotated[float, Range(0, 1)] = 0.7
 
     def __post_init__(self) -> None:
-        check("hdri_fraction", self.hdri_fraction, 0.0, 1.0)
-        check("photo_fraction", self.photo_fraction, 0.0, 1.0)
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -198,21 +177,14 @@ class SensorConfig:
         jpeg_fraction: Fraction of scenes with JPEG compression.
     """
 
-    exposure_ev: Range = (-0.5, 0.5)
-    white_balance: float = 0.08
-    noise_sigma: Range = (0.0, 0.03)
-    blur_sigma_px: Range = (0.0, 0.9)
-    motion_px: Range = (1.0, 5.0)
-    motion_fraction: float = 0.15
-    jpeg_quality: IntRange = (60, 98)
-    jpeg_fraction: float = 0.5
+    exposure_ev: Annotated[tuple[float, float], Range(-10, 10)] = (-0.5, 0.5)
+    white_balance: Annotated[float, Range(0, 1)] = 0.08
+    noise_sigma: Annotated[tuple[float, float], Range(0, 1)] = (0.0, 0.03)
+    blur_sigma_px: Annotated[tuple[float, float], Range(0, 20)] = (0.0, 0.9)
+    motion_px: Annotated[tuple[float, float], Range(0, 64)] = (1.0, 5.0)
+    motion_fraction: Annotated[float, Range(0, 1)] = 0.15
+    jpeg_quality: Annotated[tuple[int, int], Range(1, 100)] = (60, 98)
+    jpeg_fraction: Annotated[float, Range(0, 1)] = 0.5
 
     def __post_init__(self) -> None:
-        check_range("exposure_ev", self.exposure_ev, -10.0, 10.0)
-        check("white_balance", self.white_balance, 0.0, 1.0)
-        check_range("noise_sigma", self.noise_sigma, 0.0, 1.0)
-        check_range("blur_sigma_px", self.blur_sigma_px, 0.0, 20.0)
-        check_range("motion_px", self.motion_px, 0.0, 64.0)
-        check_range("jpeg_quality", self.jpeg_quality, 1, 100)
-        for name in ("motion_fraction", "jpeg_fraction"):
-            check(name, getattr(self, name), 0.0, 1.0)
+        check_ranges(self)
