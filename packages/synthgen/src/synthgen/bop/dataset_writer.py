@@ -1,13 +1,11 @@
 """Whole camera images with ground truth in BOP's layout, for evaluation or training."""
 
 import json
-import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -24,10 +22,10 @@ from posecore.bop import (
     write_models,
     write_targets,
 )
-from posecore.errors import ConfigError, DatasetError, RenderError
+from posecore.errors import ConfigError, DatasetError
 from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh
-from posecore.processes import behave_as_worker, interrupts_ignored
+from posecore.processes import behave_as_worker, map_unordered
 
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig, migrate
@@ -165,16 +163,12 @@ def write_dataset(
         )
         if not (folder / "camera.json").exists():
             write_camera(folder, config.camera.camera(), job.depth_scale)
-        with _rendering(job, workers) as rendered:
-            _write_scenes(job, rendered, on_frame)
+        _write_scenes(job, workers, on_frame)
         if plan.split not in _JPG_SPLITS:
             write_targets(folder, plan.split, _targets(folder, config, plan))
 
 
-Rendered = Callable[[Iterable[Address]], Iterator[tuple[Address, FrameEntry]]]
-
-
-def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, int], None]) -> None:
+def _write_scenes(job: FrameJob, workers: int, on_frame: Callable[[int, int], None]) -> None:
     """Render the missing frames; a scene's JSON files are written with its last frame, or when the run ends early."""
     writers: dict[int, BopWriter] = {}
     remaining: dict[int, int] = {}
@@ -195,116 +189,49 @@ def _write_scenes(job: FrameJob, rendered: Rendered, on_frame: Callable[[int, in
                 writer.close()
 
     try:
-        for (scene_id, im_id), entry in rendered(missing()):
-            writers[scene_id].commit(im_id, entry)
-            remaining[scene_id] -= 1
-            if not remaining[scene_id]:
-                writers.pop(scene_id).close()
-            on_frame(scene_id, im_id)
+        with closing(_rendered(job, missing(), workers)) as frames:
+            for (scene_id, im_id), entry in frames:
+                writers[scene_id].commit(im_id, entry)
+                remaining[scene_id] -= 1
+                if not remaining[scene_id]:
+                    writers.pop(scene_id).close()
+                on_frame(scene_id, im_id)
     finally:
         for writer in writers.values():
             writer.close()
 
 
-@contextmanager
-def _rendering(job: FrameJob, workers: int) -> Iterator[Rendered]:
-    """A function that renders frames and yields each entry when its frame is complete."""
-    if workers > 1:
-        with Pool(job, workers) as pool:
-            yield pool.rendered
+def _rendered(job: FrameJob, addresses: Iterator[Address], workers: int) -> Generator[tuple[Address, FrameEntry]]:
+    """Frames with their entries as they are complete; a complete dataset starts neither engine nor process."""
+    first = next(addresses, None)
+    if first is None:
         return
-    renderer: list[FrameRenderer] = []  # made at the first frame, because a complete dataset needs none
-
-    def rendered(addresses: Iterable[Address]) -> Iterator[tuple[Address, FrameEntry]]:
-        for address in addresses:
-            if not renderer:
-                renderer.append(FrameRenderer(job))
-            yield address, renderer[0].write(*address)
-
+    if workers > 1:
+        yield from map_unordered(
+            _write,
+            chain((first,), addresses),
+            workers,
+            start=_start,
+            arguments=(job,),
+            died=_crash_message,
+            ahead=_AHEAD,
+            attempts=_CRASHES,
+            on_crash=partial(_sweep, job.root),
+        )
+        return
+    renderer = FrameRenderer(job)
     try:
-        yield rendered
+        for address in chain((first,), addresses):
+            yield address, renderer.write(*address)
     finally:
-        for instance in renderer:
-            instance.close()
+        renderer.close()
 
 
-class Pool:
-    """Processes that render frames; ones that die are replaced, and their frames are rendered again."""
-
-    def __init__(self, job: FrameJob, workers: int) -> None:
-        self._job, self._workers = job, workers
-        self._executor: ProcessPoolExecutor | None = None
-
-    def __enter__(self) -> "Pool":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop()
-
-    def rendered(self, addresses: Iterable[Address]) -> Iterator[tuple[Address, FrameEntry]]:
-        """Render frames, in any order.
-
-        Raises:
-            RenderError: Processes keep dying.
-        """
-        following, running = iter(addresses), list[Address]()
-        crashes = 0
-        while True:
-            try:
-                for address, entry in self._until_crash(chain(tuple(running), following), running):
-                    running.remove(address)
-                    crashes = 0
-                    yield address, entry
-                return
-            except BrokenProcessPool as error:
-                crashes += 1
-                self._stop()
-                _sweep(self._job.root)
-                if crashes == _CRASHES:
-                    raise RenderError(
-                        f"a worker process died {_CRASHES} times (out of memory, or a crash in the renderer) around "
-                        f"scene {running[0][0]}, image {running[0][1]}; start the same command again with fewer "
-                        "--workers or another --engine"
-                    ) from error
-
-    def _until_crash(
-        self, addresses: Iterator[Address], running: list[Address]
-    ) -> Iterator[tuple[Address, FrameEntry]]:
-        futures: dict[Future[FrameEntry], Address] = {}
-
-        def submit() -> None:
-            address = next(addresses, None)
-            if address is not None:
-                if address not in running:
-                    running.append(address)
-                futures[self._started().submit(_write, *address)] = address
-
-        for _ in range(_AHEAD * self._workers):
-            submit()
-        while futures:
-            done, _ = wait(futures, return_when=FIRST_COMPLETED)
-            for future in done:
-                entry = future.result()
-                yield futures.pop(future), entry
-                submit()
-
-    def _started(self) -> ProcessPoolExecutor:
-        if self._executor is None:
-            self._executor = ProcessPoolExecutor(
-                self._workers,
-                mp_context=multiprocessing.get_context("spawn"),  # a forked Blender is undefined
-                initializer=_start,
-                initargs=(self._job,),
-            )
-            with interrupts_ignored():  # a terminal sends ctrl-C to all; only this process may stop the run
-                for _ in range(self._workers):
-                    self._executor.submit(os.getpid)
-        return self._executor
-
-    def _stop(self) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(wait=True, cancel_futures=True)
-            self._executor = None
+def _crash_message(address: Address) -> str:
+    return (
+        f"a worker process died {_CRASHES} times (out of memory, or a crash in the renderer) around scene "
+        f"{address[0]}, image {address[1]}; start the same command again with fewer --workers or another --engine"
+    )
 
 
 class _Worker:
@@ -320,10 +247,10 @@ def _start(job: FrameJob) -> None:
     _Worker.job = job
 
 
-def _write(scene_id: int, im_id: int) -> FrameEntry:
+def _write(address: Address) -> FrameEntry:
     if _Worker.renderer is None:
         _Worker.renderer = FrameRenderer(_Worker.job)
-    return _Worker.renderer.write(scene_id, im_id)
+    return _Worker.renderer.write(*address)
 
 
 def _depth_scale(config: SynthConfig, targets: Iterable[TargetObject]) -> float:

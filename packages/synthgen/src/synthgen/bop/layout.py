@@ -120,7 +120,7 @@ class BoundingSpheres:
     def sphere(self, placed: SceneObject) -> tuple[Float[Array, "3"], float]:
         """Centre, in the frame of the pose, and radius."""
         mesh, T = self.meshes[placed.mesh_key], placed.T_cam_obj
-        return T[:3, :3] @ mesh.center_m + T[:3, 3], radius_m(mesh)
+        return mesh.center_cam_m(T), radius_m(mesh)
 
     def is_free(self, centre: Float[Array, "3"], radius: float, placed: Sequence[SceneObject]) -> bool:
         """Whether a sphere is disjoint from those of all placed objects."""
@@ -258,10 +258,8 @@ def _floating(
         if together:
             neighbour, r = spheres.sphere(placed[int(rng.integers(len(placed)))])
             gap = rng.uniform(*config.frames.gap_diameter) * target.mesh.diameter_m
-            T[:3, 3] += (
-                neighbour + random_direction(rng) * (r + radius + gap) - (T[:3, :3] @ target.mesh.center_m + T[:3, 3])
-            )
-        if spheres.is_free(T[:3, :3] @ target.mesh.center_m + T[:3, 3], radius, (*placed, *others)):
+            T[:3, 3] += neighbour + random_direction(rng) * (r + radius + gap) - target.mesh.center_cam_m(T)
+        if spheres.is_free(target.mesh.center_cam_m(T), radius, (*placed, *others)):
             return T
     return None
 

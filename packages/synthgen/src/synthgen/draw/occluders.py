@@ -148,7 +148,7 @@ def _path(
     lift: Callable[[SceneObject], SceneObject],
 ) -> Callable[[float], SceneObject]:
     """Path of an occluder at constant depth, from a position where it hides nothing (0) to one over the object (1)."""
-    centre = item.T_cam_obj[:3, :3] @ shape.center_m + item.T_cam_obj[:3, 3]
+    centre = shape.center_cam_m(item.T_cam_obj)
     scale = centre[2] / centre_cam_m[2]
     angle = rng.uniform(0, 2 * math.pi)
     over = centre_cam_m * scale + _sideways(rng) * rng.uniform(0.0, 0.35) * diameter_m * scale

@@ -77,9 +77,9 @@ def draw_hypothesis(
     angle = math.radians(config.max_angle_deg) * ease * rng.uniform()
     length_m = config.max_translation_diameter * mesh.diameter_m * ease * rng.uniform()
     dR = rotation_from_rotvec(random_direction(rng) * angle)
-    R, t = T_cam_obj[:3, :3], T_cam_obj[:3, 3]
-    centre = R @ mesh.center_m + t + random_direction(rng) * length_m
-    return make_T(dR @ R, centre - dR @ R @ mesh.center_m)
+    centre = mesh.center_cam_m(T_cam_obj) + random_direction(rng) * length_m
+    R = dR @ T_cam_obj[:3, :3]
+    return make_T(R, centre - R @ mesh.center_m)
 
 
 def target_box(target: TargetObject, camera: Camera, T_cam_obj: Float[Array, "4 4"]) -> Float[Array, "4"]:

@@ -92,7 +92,7 @@ def draw_scene(
     target = targets[target_index(config.seed, purpose, scene_index, len(targets))]
     is_tabletop = _is_tabletop(config, purpose, scene_index)
     T_cam_obj, T_cam_table, placement = _draw_poses(config, target, rng, is_tabletop)
-    centre, diameter_m = _centre(target, T_cam_obj), target.mesh.diameter_m
+    centre, diameter_m = target.mesh.center_cam_m(T_cam_obj), target.mesh.diameter_m
     front, around = occluders.draw_occluders(
         rng(Subject.OCCLUDERS), config.occluders, target.shapes, centre, diameter_m
     )
@@ -189,14 +189,10 @@ def adjust_visibility(draw: SceneDraw, config: SynthConfig, visible_of: Callable
         stream(config.seed, purpose, Subject.VISIBILITY, scene_index, attempt),
         config.occluders,
         shapes,
-        _centre(draw.target, draw.T_cam_obj),
+        draw.target.mesh.center_cam_m(draw.T_cam_obj),
         draw.target.mesh.diameter_m,
         draw.front,
         lambda front: visible_of(replace(draw, front=front)),
         lift,
     )
     return replace(draw, front=front)
-
-
-def _centre(target: TargetObject, T_cam_obj: Float[Array, "4 4"]) -> Float[Array, "3"]:
-    return np.asarray(T_cam_obj[:3, :3] @ target.mesh.center_m + T_cam_obj[:3, 3])

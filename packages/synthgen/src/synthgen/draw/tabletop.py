@@ -141,7 +141,7 @@ def raise_above_table(item: SceneObject, mesh: Mesh, T_cam_table: Float[Array, "
     """
     up, origin = T_cam_table[:3, 2], T_cam_table[:3, 3]
     T = item.T_cam_obj
-    centre = T[:3, :3] @ mesh.center_m + T[:3, 3]
+    centre = mesh.center_cam_m(T)
     below_m = float(-((mesh.vertices_m - mesh.center_m) @ (T[:3, :3].T @ up)).min())  # extent below the centre
     height_m, camera_height_m = float((centre - origin) @ up), float(-origin @ up)
     if height_m > below_m or camera_height_m <= below_m:

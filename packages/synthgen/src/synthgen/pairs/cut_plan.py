@@ -142,7 +142,7 @@ class _PairSelector:
             for gt in image.annotated:
                 if self.rejection(image, gt):
                     continue
-                z = float(centre_m(gt.T_cam_obj, self.meshes[gt.obj_id])[2])
+                z = float(self.meshes[gt.obj_id].center_cam_m(gt.T_cam_obj)[2])
                 magnification = max(K[0, 0], K[1, 1]) / z
                 if gt.obj_id not in nearest or magnification > nearest[gt.obj_id][0]:
                     nearest[gt.obj_id] = magnification, K, z
@@ -170,8 +170,8 @@ class _PairSelector:
                 self.left_out["hypotheses are of objects that are not annotated there"] += 1
                 continue
             mesh = self.meshes[obj_id]
-            centre = centre_m(T_hypothesis, mesh)
-            distances_m = [np.linalg.norm(centre_m(gt.T_cam_obj, mesh) - centre) for gt in instances]
+            centre = mesh.center_cam_m(T_hypothesis)
+            distances_m = [np.linalg.norm(mesh.center_cam_m(gt.T_cam_obj) - centre) for gt in instances]
             gt = instances[int(np.argmin(distances_m))]
             yield counts[gt.gt_index], gt, T_hypothesis
             counts[gt.gt_index] += 1
@@ -195,11 +195,6 @@ class _PairSelector:
             self.left_out[f"pairs show an object on less than {config.min_area_px:g} pixels"] += 1
             return None
         return window
-
-
-def centre_m(T_cam_obj: Pose, mesh: Mesh) -> Float[Array, "3"]:
-    """The object's box centre in the camera frame."""
-    return np.asarray(T_cam_obj[:3, :3] @ mesh.center_m + T_cam_obj[:3, 3])
 
 
 def _hull_area_px(K: Float[Array, "3 3"], points_m: Float[Array, "h 3"]) -> float:
@@ -263,7 +258,7 @@ def _images(dataset: BopDataset, subset: set[tuple[int, int]] | None, config: Cu
                 number=number,
                 scene_index=scenes[scene_id, im_id],
                 camera=dataset.camera(scene_id, im_id),
-                annotated=[gt for gt in annotated if centre_m(gt.T_cam_obj, meshes[gt.obj_id])[2] > 0],
+                annotated=[gt for gt in annotated if meshes[gt.obj_id].center_cam_m(gt.T_cam_obj)[2] > 0],
             )
         )
     return images
@@ -343,7 +338,7 @@ def make_card(dataset: BopDataset, planned: Plan, config: CutConfig, *, drawn: b
     """
     camera = planned.images[0].camera
     deepest_m = max(
-        float(centre_m(T, dataset.mesh(obj_id))[2]) + dataset.mesh(obj_id).diameter_m
+        float(dataset.mesh(obj_id).center_cam_m(T)[2]) + dataset.mesh(obj_id).diameter_m
         for image in planned.images
         for obj_id, T in (
             *((gt.obj_id, gt.T_cam_obj) for gt in image.annotated),
