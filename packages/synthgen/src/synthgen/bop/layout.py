@@ -60,7 +60,7 @@ class Layout:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraView:
-    """A layout as viewed by the camera of one image.
+    """A layout in the view of an image's camera.
 
     Attributes:
         layout: Objects and light.

@@ -18,7 +18,7 @@ _TOLERANCE = 1e-6  # fraction of the diameter within which planes and heights ar
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StablePoses:
-    """Stable poses of one mesh.
+    """Stable poses of a mesh.
 
     Attributes:
         hull_m: (h, 3) vertices of the convex hull, object coordinates.

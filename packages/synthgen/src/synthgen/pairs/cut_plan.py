@@ -299,7 +299,7 @@ def _require_one_size(dataset: BopDataset, images: Sequence[AnnotatedImage], *, 
     if size[:2] != other[:2]:
         raise DatasetError(
             f"{dataset.split_path}: {where} is {size[0]} x {size[1]} pixels and {different} {other[0]} x {other[1]}, "
-            "expected images of one size; cut each size as a dataset of its own, or choose one with --sensor"
+            "expected images of equal size; cut each size as a dataset of its own, or choose one with --sensor"
         )
     raise DatasetError(
         f"{dataset.split_path}: {where} has fx {size[2]:g} and {different} {other[2]:g}, expected one focal length for "
