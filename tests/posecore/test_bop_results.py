@@ -11,11 +11,11 @@ from posecore.bop import (
     BopDataset,
     Estimate,
     ResultTable,
+    estimate_table,
     read_result_table,
     read_results,
     read_sidecar,
     sidecar_path,
-    table_of,
     write_results,
 )
 from posecore.bop.result_table import COLUMNS, parse_results
@@ -282,7 +282,7 @@ def test_all_faults_are_told_and_the_good_lines_kept():
 
 
 def test_a_table_is_cut_and_joined():
-    table = table_of([estimate(seed) for seed in range(4)])
+    table = estimate_table([estimate(seed) for seed in range(4)])
     both = ResultTable.concat([table.take(np.array([3])), table.take(table.im_id < 2)])
     assert both.im_id.tolist() == [3, 0, 1]
     assert np.array_equal(both.T_cam_obj[0], estimate(3).T_cam_obj)
