@@ -11,11 +11,11 @@ from posecore.bop import (
     BopDataset,
     Estimate,
     ResultTable,
+    estimate_table,
     read_result_table,
     read_results,
     read_sidecar,
     sidecar_path,
-    table_of,
     write_results,
 )
 from posecore.bop.result_table import COLUMNS, parse_results
@@ -95,7 +95,7 @@ def test_broken_lines_are_named(tmp_path, line, message):
 def test_metres_are_suspected(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(f"{HEADER}\n1,2,3,0.5,1 0 0 0 1 0 0 0 1,0.01 0.02 0.9,-1\n")
-    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, which looks like metres"):
+    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, probably in metres"):
         read_results(path)
 
 
@@ -282,7 +282,7 @@ def test_all_faults_are_told_and_the_good_lines_kept():
 
 
 def test_a_table_is_cut_and_joined():
-    table = table_of([estimate(seed) for seed in range(4)])
+    table = estimate_table([estimate(seed) for seed in range(4)])
     both = ResultTable.concat([table.take(np.array([3])), table.take(table.im_id < 2)])
     assert both.im_id.tolist() == [3, 0, 1]
     assert np.array_equal(both.T_cam_obj[0], estimate(3).T_cam_obj)

@@ -22,7 +22,7 @@ from evalkit.report.summary import start_of
 from evalkit.scores import by_object, scores
 from evalkit.scores.convergence import by_level
 from posecore import se3
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target, symmetry_transforms, write_results, write_targets
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth, symmetry_transforms, write_results, write_targets
 from posecore.errors import DatasetError, RenderError, ResultFileError
 
 from ..conftest import BOBBIN, CAMERA, IMAGES, TUG
@@ -148,7 +148,7 @@ def test_instances_take_the_nearest_free_truth(dataset_path, tmp_path):
     content["0"].append(second)
     file.write_text(json.dumps(content))
     (root / "test/000004/scene_gt_info.json").unlink()
-    write_targets(root, "test", [Target(scene_id=4, im_id=0, obj_id=TUG, inst_count=2)])
+    write_targets(root, "test", [BopTarget(scene_id=4, im_id=0, obj_id=TUG, inst_count=2)])
     dataset = BopDataset(root)
     first, third = (gt for gt in dataset.gt(4, 0) if gt.obj_id == TUG)
     estimates = [
@@ -164,7 +164,7 @@ def test_instances_take_the_nearest_free_truth(dataset_path, tmp_path):
 def test_target_without_truth_is_an_error(dataset_path, tmp_path, perfect):
     root = tmp_path / "toys"
     shutil.copytree(dataset_path, root)
-    write_targets(root, "test", [Target(scene_id=4, im_id=0, obj_id=3)])
+    write_targets(root, "test", [BopTarget(scene_id=4, im_id=0, obj_id=3)])
     with pytest.raises(DatasetError, match=r"scene_gt.json: image 0 has no pose of object 3"):
         pair_up(BopDataset(root), in_memory(perfect))
 

@@ -1,4 +1,4 @@
-"""Object symmetries: the transforms that map an object onto itself, sampled finely enough to take a minimum over."""
+"""Object symmetries: transforms that map an object onto itself, sampled or solved for."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
@@ -7,8 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore import se3
-
-Array = np.ndarray
 
 BOP_STEP_RAD = 0.02
 """bop_toolkit's default: no surface point moves by more than 0.01 diameters between neighbouring samples."""
@@ -34,10 +32,10 @@ class ContinuousSymmetry(NamedTuple):
 
 @runtime_checkable
 class Symmetric(Protocol):
-    """What has symmetries: `posecore.bop.ModelInfo`."""
+    """An object with symmetries: `posecore.bop.ModelInfo`."""
 
     @property
-    def symmetries_discrete(self) -> tuple[Float[Array, "4 4"], ...]:
+    def symmetries_discrete(self) -> tuple[Float[np.ndarray, "4 4"], ...]:
         """Transforms in the object frame, metres, without the identity."""
         ...
 
@@ -48,8 +46,8 @@ class Symmetric(Protocol):
 
 
 def rotations_about_axis(
-    axis: Float[Array, "3"], angles_rad: Float[Array, " n"], offset_m: Float[Array, "3"]
-) -> Float[Array, "n 4 4"]:
+    axis: Float[np.ndarray, "3"], angles_rad: Float[np.ndarray, " n"], offset_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "n 4 4"]:
     """Rotate about the line through `offset_m` along `axis` (any length but zero), by each angle."""
     unit = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
     cross = np.array([[0.0, -unit[2], unit[1]], [unit[2], 0.0, -unit[0]], [-unit[1], unit[0], 0.0]])
@@ -61,18 +59,18 @@ def rotations_about_axis(
     return transforms
 
 
-def _turns(step_rad: float) -> Float[Array, " n"]:
+def _angles_rad(step_rad: float) -> Float[np.ndarray, " n"]:
     count = max(1, int(np.ceil(2.0 * np.pi / step_rad - 1e-9)))
     return np.arange(count) * (2.0 * np.pi / count)
 
 
 def is_ball(continuous: Sequence[ContinuousSymmetry]) -> bool:
-    """Whether the axes generate every rotation: two of them are not parallel."""
+    """Whether the axes generate every rotation: any two are not parallel."""
     first = np.array(continuous[0].axis) if continuous else np.zeros(3)
     return any(np.linalg.norm(np.cross(first, other.axis)) > 1e-3 for other in continuous[1:])
 
 
-def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[Array, "3"]:
+def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[np.ndarray, "3"]:
     """The point all axes of a ball pass through (least squares, object frame, metres)."""
     normal, right = np.zeros((3, 3)), np.zeros(3)
     for symmetry in continuous:
@@ -82,25 +80,25 @@ def ball_center_m(continuous: Sequence[ContinuousSymmetry]) -> Float[Array, "3"]
     return np.asarray(np.linalg.lstsq(normal, right, rcond=None)[0], dtype=np.float64)
 
 
-def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: float) -> Float[Array, "n 4 4"]:
+def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: float) -> Float[np.ndarray, "n 4 4"]:
     if not continuous:
         return np.eye(4)[None]
     first = np.array(continuous[0].axis)
     if not is_ball(continuous):
-        return rotations_about_axis(first, _turns(step_rad), np.array(continuous[0].offset_m))
-    # Two axes composed once reach a surface in the rotation group, not all of it: Euler angles z-y-z reach all.
+        return rotations_about_axis(first, _angles_rad(step_rad), np.array(continuous[0].offset_m))
+    # Two axes composed once reach a surface in the rotation group; Euler angles z-y-z reach the whole group.
     center = ball_center_m(continuous)
     helper = np.eye(3)[int(np.argmin(np.abs(first)))]
     second = np.cross(first, helper)
     step = max(step_rad, BALL_STEP_RAD)
-    spins = rotations_about_axis(first, _turns(step), center)
+    spins = rotations_about_axis(first, _angles_rad(step), center)
     tilts = rotations_about_axis(second, np.linspace(0.0, np.pi, int(np.ceil(np.pi / step)) + 1), center)
     inner = np.einsum("aij,bjk->abik", tilts[1:-1], spins).reshape(-1, 4, 4)
     body = np.einsum("aij,bjk->abik", spins, inner).reshape(-1, 4, 4)
     return np.concatenate([spins, body, tilts[-1] @ spins])
 
 
-def symmetry_transforms(info: Symmetric, max_step_rad: float = BOP_STEP_RAD) -> Float[Array, "s 4 4"]:
+def symmetry_transforms(info: Symmetric, max_step_rad: float = BOP_STEP_RAD) -> Float[np.ndarray, "s 4 4"]:
     """All symmetries of an object: every sampled continuous one after the identity and every discrete one.
 
     The identity comes first. As in BOP, the discrete symmetries are taken as listed and not completed to a group.
@@ -109,21 +107,21 @@ def symmetry_transforms(info: Symmetric, max_step_rad: float = BOP_STEP_RAD) -> 
 
     Args:
         info: discrete and continuous symmetries of the object.
-        max_step_rad: largest angle between neighbouring samples of one axis.
+        max_step_rad: largest angle between neighbouring samples about an axis.
 
     Returns:
-        Transforms S with `T_cam_obj @ S` looking the same as `T_cam_obj`.
+        Transforms S with which `T_cam_obj @ S` has the same appearance as `T_cam_obj`.
     """
     fixed = np.stack([np.eye(4), *info.symmetries_discrete])
-    turning = _continuous_transforms(info.symmetries_continuous, max_step_rad)
-    return np.asarray(np.einsum("cij,djk->cdik", turning, fixed).reshape(-1, 4, 4))
+    continuous = _continuous_transforms(info.symmetries_continuous, max_step_rad)
+    return np.asarray(np.einsum("cij,djk->cdik", continuous, fixed).reshape(-1, 4, 4))
 
 
 def align_ball(
     continuous: Sequence[ContinuousSymmetry],
-    T_cam_obj: Float[Array, "4 4"],
-    T_cam_obj_other: Float[Array, "4 4"],
-) -> Float[Array, "4 4"]:
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    T_cam_obj_other: Float[np.ndarray, "4 4"],
+) -> Float[np.ndarray, "4 4"]:
     """The ball's symmetry S that gives `T_cam_obj @ S` the rotation of `T_cam_obj_other`: exact, no sampling."""
     center = ball_center_m(continuous)
     S = np.eye(4)
@@ -133,13 +131,13 @@ def align_ball(
 
 
 def nearest_symmetric(
-    T_cam_obj: Float[Array, "*b 4 4"],
-    T_reference: Float[Array, "*b 4 4"],
+    T_cam_obj: Float[np.ndarray, "*b 4 4"],
+    T_reference: Float[np.ndarray, "*b 4 4"],
     info: Symmetric,
     *,
     by: Literal["rotation", "points"] = "rotation",
-    points_m: Float[Array, "p 3"] | None = None,
-) -> Float[Array, "*b 4 4"]:
+    points_m: Float[np.ndarray, "p 3"] | None = None,
+) -> Float[np.ndarray, "*b 4 4"]:
     """The pose symmetry-equivalent to `T_cam_obj` that is nearest to `T_reference`.
 
     Of the discrete symmetries each is tried, as listed, after the identity; of equally near poses the first is taken.
@@ -168,13 +166,13 @@ def nearest_symmetric(
 
 
 def symmetric_copies(
-    T_cam_obj: Float[Array, "*b 4 4"],
-    T_reference: Float[Array, "*b 4 4"],
+    T_cam_obj: Float[np.ndarray, "*b 4 4"],
+    T_reference: Float[np.ndarray, "*b 4 4"],
     info: Symmetric | None,
     *,
     by: Literal["rotation", "points"] = "rotation",
-    points_m: Float[Array, "p 3"] | None = None,
-) -> Float[Array, "*b s 4 4"]:
+    points_m: Float[np.ndarray, "p 3"] | None = None,
+) -> Float[np.ndarray, "*b s 4 4"]:
     """Poses symmetry-equivalent to `T_cam_obj`, one for each discrete symmetry, the identity first; one for a ball.
 
     With an axis of revolution, each is rotated about it to come nearest to `T_reference`; see `nearest_symmetric`.
@@ -200,15 +198,15 @@ def symmetric_copies(
     return np.asarray(T_cam_obj[..., None, :, :] @ (_rotation_nearest(M, axis, offset_m) @ fixed))
 
 
-def _required(points_m: Float[Array, "p 3"] | None) -> Float[Array, "p 3"]:
+def _required(points_m: Float[np.ndarray, "p 3"] | None) -> Float[np.ndarray, "p 3"]:
     if points_m is None:
         raise ValueError("nearest_symmetric by points needs points_m")
     return points_m
 
 
 def _rotation_nearest(
-    M: Float[Array, "*b 3 3"], axis: Float[Array, "3"], offset_m: Float[Array, "3"]
-) -> Float[Array, "*b 4 4"]:
+    M: Float[np.ndarray, "*b 3 3"], axis: Float[np.ndarray, "3"], offset_m: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "*b 4 4"]:
     """The rotation C about a line with the largest trace of `M C^T`: the nearest to M.
 
     That trace is a constant plus `cos * (trace M - a M a) + sin * (a . w)`, with w the vector of the skew part of M:
@@ -222,11 +220,11 @@ def _rotation_nearest(
 
 
 def _ball_rotation(
-    T_cam_obj: Float[Array, "*b 4 4"],
-    T_reference: Float[Array, "*b 4 4"],
-    center_m: Float[Array, "3"],
-    points_m: Float[Array, "p 3"] | None,
-) -> Float[Array, "*b 3 3"]:
+    T_cam_obj: Float[np.ndarray, "*b 4 4"],
+    T_reference: Float[np.ndarray, "*b 4 4"],
+    center_m: Float[np.ndarray, "3"],
+    points_m: Float[np.ndarray, "p 3"] | None,
+) -> Float[np.ndarray, "*b 3 3"]:
     """The rotation about a ball's centre that brings its pose nearest: exact, by points with orthogonal Procrustes."""
     if points_m is None:
         return np.asarray(np.swapaxes(T_cam_obj[..., :3, :3], -1, -2) @ T_reference[..., :3, :3])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.errors import DatasetError, ResultFileError
 
 from evalkit.inputs.result_files import ResultFile
@@ -41,7 +41,7 @@ class Pairing:
     ignored: int
 
 
-def truths_of(dataset: BopDataset, target: Target) -> list[GroundTruth]:
+def truths_of(dataset: BopDataset, target: BopTarget) -> list[GroundTruth]:
     """Annotated instances of a target with a pose, the most visible first.
 
     Raises:

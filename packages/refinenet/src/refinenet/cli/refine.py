@@ -142,7 +142,7 @@ def refine(
         torch.set_num_threads(threads)
     loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     bop = BopDataset(dataset, split)
-    given = read_results(init, bop, of="camera")
+    given = read_results(init, bop, images="camera")
     starts = [s for s in given if not objects or s.obj_id in objects]
     if not given:
         raise ConfigError(f"{init}: no poses in it, there is nothing to refine")

@@ -228,7 +228,7 @@ class _Patches:
         in_pairs = {pair.gt.gt_index for pair in image.pairs}
         front, hidden = np.zeros((height, width), bool), {}
         for index, gt in enumerate(image.annotated):
-            stored = self._dataset.mask_and_place(scene_id, im_id, gt.gt_index, "mask_visib")
+            stored = self._dataset.mask_and_location(scene_id, im_id, gt.gt_index, "mask_visib")
             visible, file = (rendered.instance == index, "") if stored is None else stored
             if visible.shape != front.shape:
                 raise DatasetError(
