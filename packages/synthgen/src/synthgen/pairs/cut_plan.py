@@ -30,8 +30,7 @@ from synthgen.draw.target import hull
 from synthgen.image.region import contains
 from synthgen.pairs.data_card import DEPTH_STEPS, FINEST_DEPTH_STEP_M, UNITS, package_versions
 
-Array = np.ndarray
-Pose = Float[Array, "4 4"]
+Pose = Float[np.ndarray, "4 4"]
 _CAMERA_PX = 1e-6
 """Largest difference between the entries of equal camera matrices."""
 
@@ -136,7 +135,7 @@ class _PairSelector:
 
     def _fixed_windows(self, images: Sequence[AnnotatedImage]) -> dict[int, float]:
         """Window side of every object, large enough for its largest pose in the images (focal length over distance)."""
-        nearest: dict[int, tuple[float, Array, float]] = {}
+        nearest: dict[int, tuple[float, np.ndarray, float]] = {}
         for image in images:
             K = image.camera.K
             for gt in image.annotated:
@@ -197,7 +196,7 @@ class _PairSelector:
         return window
 
 
-def _hull_area_px(K: Float[Array, "3 3"], points_m: Float[Array, "h 3"]) -> float:
+def _hull_area_px(K: Float[np.ndarray, "3 3"], points_m: Float[np.ndarray, "h 3"]) -> float:
     """Area of a silhouette's convex hull."""
     return float(cv2.contourArea(cv2.convexHull(project(K, points_m).astype(np.float32))))
 
