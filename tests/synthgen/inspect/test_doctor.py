@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from synthgen import machine
 from synthgen.cli import main
 from synthgen.inspect import doctor
 from synthgen.inspect.speed import Speed
@@ -59,21 +58,6 @@ def test_software_gl_is_warned_about(no_blender, monkeypatch, tmp_path, device, 
     assert doctor.Engines(names=("cycles", "eevee", "raster"), software_gl=software).worth_measuring() == (
         ("cycles", "raster") if software else ("cycles", "eevee", "raster")
     )
-
-
-def test_resources_respect_the_control_group(monkeypatch, tmp_path):
-    monkeypatch.setattr(machine, "_CGROUP", tmp_path)
-    (tmp_path / "cpu.max").write_text("50000 100000\n")
-    (tmp_path / "memory.max").write_text(f"{256 * 2**20}\n")
-    here = machine.machine()
-    assert here.cores == 0.5
-    assert here.memory_bytes == 256 * 2**20
-    (tmp_path / "cpu.max").write_text("max 100000\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    here = machine.machine()
-    assert here.cores == machine.cores()
-    assert here.memory_bytes > 256 * 2**20
-    assert machine.free_bytes(tmp_path / "not" / "there") == machine.free_bytes(tmp_path)
 
 
 def test_time_and_space_are_extrapolated():

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from posecore.errors import StorageError
+from synthgen import lock
 from synthgen.engines.blender import scratch
-from synthgen.run import lock
 
 
 def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):
@@ -25,7 +25,7 @@ def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):
 
 
 def test_the_lock_goes_with_a_killed_process(tmp_path):
-    code = f"import os\nfrom synthgen.run import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
+    code = f"import os\nfrom synthgen import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
     with lock.held(str(tmp_path)):
         pass
@@ -46,7 +46,7 @@ def test_a_sweep_removes_what_killed_processes_left_and_nothing_else(tmp_path, m
     (mine / "layers.exr").write_bytes(b"mine")
     (tmp_path / "synthgen_file").write_text("not a folder")
     code = (
-        "import os\nfrom pathlib import Path\nfrom synthgen.run import scratch\n"
+        "import os\nfrom pathlib import Path\nfrom synthgen.engines.blender import scratch\n"
         f"scratch._SHARED_MEMORY = Path({str(tmp_path)!r})\n"
         "folder, _ = scratch.make_folder()\n(folder / 'layers.exr').write_bytes(b'lost')\nos.kill(os.getpid(), 9)"
     )

@@ -5,7 +5,10 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from posecore.errors import StorageError
+
 _CGROUP = Path("/sys/fs/cgroup")
+_SPARE_BYTES = 256 * 2**20  # left free on the disk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,6 +56,26 @@ def free_bytes(path: Path) -> int:
     while not place.exists():
         place = place.parent
     return shutil.disk_usage(place).free
+
+
+def require_free_space(url: str, needed_bytes: int) -> None:
+    """Check that the disk of a folder, or of its nearest existing parent, has room; URLs are not checked.
+
+    Args:
+        url: Dataset.
+        needed_bytes: Bytes still to be written there.
+
+    Raises:
+        StorageError: Less is free than needed; the message names both and the remedies.
+    """
+    if "://" in url:
+        return
+    free = free_bytes(Path(url))
+    if free < needed_bytes + _SPARE_BYTES:
+        raise StorageError(
+            f"{url}: {size_text(free)} free, about {size_text(needed_bytes + _SPARE_BYTES)} needed; free some space, "
+            "choose another --out, or a smaller --n"
+        )
 
 
 def _cgroup_cores() -> float:

@@ -63,13 +63,12 @@ def cut(
     from posecore.bop import BopDataset, splits_of
     from posecore.shard import ShardWriter
 
+    from synthgen import lock
     from synthgen.config import CutConfig
-    from synthgen.machine import size_text
+    from synthgen.machine import require_free_space, size_text
     from synthgen.pairs import cut_plan
     from synthgen.pairs.cut import cut_pairs
-    from synthgen.pairs.data_card import estimated_bytes, model_files
-    from synthgen.run import lock
-    from synthgen.run.estimate import check_free_space
+    from synthgen.pairs.data_card import cut_card, estimated_bytes, model_files
 
     given = {key: value for key, value in values.items() if value is not None}
     mapping = config_tools.apply_overrides({}, overrides) | given
@@ -83,10 +82,10 @@ def cut(
     for reason, count in sorted(planned.left_out.items()):
         click.echo(f"{images.split_path}: left out: {count} {reason}", err=True)
     with lock.held(out), stoppable(out):
-        writer = ShardWriter.create(out, cut_plan.make_card(images, planned, config, drawn=hypotheses is None))
+        writer = ShardWriter.create(out, cut_card(images, planned, config, drawn=hypotheses is None))
         missing = planned.n - len(writer.committed()) * config.shard_size
         size = estimated_bytes(config.patch_px, config.contour_points, max(0, missing))
-        check_free_space(out, size)
+        require_free_space(out, size)
         click.echo(f"{out}: {planned.n} pairs of {images.split_path}, about {size_text(size)} more", err=True)
         infos = images.models_info
         for key, data in model_files(planned.meshes, {i: infos[i] for i in planned.meshes if i in infos}).items():

@@ -23,8 +23,8 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
         raise click.UsageError("give two datasets or more")
     from posecore.shard import ShardWriter
 
+    from synthgen import lock
     from synthgen.pairs.merge import merged_card, open_parts, write_merged
-    from synthgen.run import lock
 
     parts = open_parts(datasets)
     card = merged_card(parts)

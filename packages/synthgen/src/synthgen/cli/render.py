@@ -91,9 +91,10 @@ def render(
     """
     from posecore.shard import ShardWriter
 
+    from synthgen import lock
     from synthgen.config import load_config
     from synthgen.pairs import data_card
-    from synthgen.run import dispatcher, lock
+    from synthgen.run import dispatcher
     from synthgen.run.shard_job import ShardJob
 
     if workers and scheduler:
@@ -105,7 +106,7 @@ def render(
     start_logging(verbose)
     config, gpus = _with_device(load_config(preset, overrides, values), scheduler)
     meshes, assets = sources.meshes(), sources.assets()
-    card = data_card.make_card(config, n, meshes, assets)
+    card = data_card.rendered_card(config, n, meshes, assets)
     cores = len(os.sched_getaffinity(0))
     workers = workers or len(gpus) or min(MOST_WORKERS, cores)
     if only is not None:
@@ -184,20 +185,20 @@ def _prospect(out: str, job: "ShardJob", missing: int, workers: int | None) -> s
     """
     from posecore.errors import RenderError
 
-    from synthgen.machine import size_text
+    from synthgen.machine import require_free_space, size_text
     from synthgen.pairs import data_card
-    from synthgen.run.estimate import check_free_space, estimate
+    from synthgen.run.estimate import estimate
 
     if missing < MEASURED_FROM:
         size = data_card.estimated_bytes(job.config.patch_px, job.config.contour_points, missing)
-        check_free_space(out, size)
+        require_free_space(out, size)
         return f"about {size_text(size)} more"
     try:
         found = estimate(job)
     except RenderError as error:  # one scene may be to blame, or this machine only gives orders: the workers will see
         return f"size and time unknown ({error})"
     size = found.bytes(missing)
-    check_free_space(out, size)
+    require_free_space(out, size)
     time = "" if workers is None else f" and {_duration(found.seconds(missing, workers))}"
     return f"about {size_text(size)}{time} more, judged by {found.pairs} pairs"
 

@@ -6,18 +6,15 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass
-from pathlib import Path
 
 from posecore import shard
-from posecore.errors import PoseError, RenderError, StorageError
+from posecore.errors import PoseError, RenderError
 from posecore.processes import die_with_parent
 
-from synthgen.machine import free_bytes, size_text
 from synthgen.pairs.pair_maker import concatenate
 from synthgen.run.shard_job import ShardJob, ShardRenderer, scenes_in
 
 _START_S = 300.0  # for Blender to start and the first scene to compile its kernels
-_SPARE_BYTES = 256 * 2**20  # of a disk that is not filled to the last byte
 _MANIFEST_BYTES = 700  # of a shard's line
 
 
@@ -79,26 +76,6 @@ def estimate(job: ShardJob, *, scenes: int = 4, most_seconds: float = 20.0) -> E
     if isinstance(answer, PoseError):
         raise answer
     return answer
-
-
-def check_free_space(url: str, needed_bytes: int) -> None:
-    """See that the disk of a folder, or of the nearest folder above that exists, has room; URLs are not looked at.
-
-    Args:
-        url: Where the dataset goes.
-        needed_bytes: What is still to be written there.
-
-    Raises:
-        StorageError: It has not; the message says what is free, what is needed and what to do.
-    """
-    if "://" in url:
-        return
-    free = free_bytes(Path(url))
-    if free < needed_bytes + _SPARE_BYTES:
-        raise StorageError(
-            f"{url}: {size_text(free)} free, about {size_text(needed_bytes + _SPARE_BYTES)} needed; free some space, "
-            "choose another --out, or a smaller --n"
-        )
 
 
 def main() -> None:
