@@ -64,7 +64,7 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     limit_threads(1)
     scenes = max(scenes, scenes_per_shard(config))  # encoding is timed on whole shards
     maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
-    card = data_card.make_card(config, config.shard_size, {1: mesh}, Assets())
+    card = data_card.rendered_card(config, config.shard_size, {1: mesh}, Assets())
     for scene in range(3):  # loads, compiles
         maker.samples(10_000_000 + scene)
     watch = Stopwatch()
