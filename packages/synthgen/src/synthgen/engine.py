@@ -2,20 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int16
 from posecore.mesh import Mesh
 
 from synthgen.scene import Scene
-
-EngineName = Literal["cycles", "eevee", "raster"]
-Device = Literal["auto", "cpu", "cuda", "optix"]
-
-ENGINE_NAMES: tuple[str, ...] = get_args(EngineName)
-GPU_DEVICES: tuple[Device, ...] = ("optix", "cuda")
-"""What 'auto' takes, the fastest first; without either it takes the CPU."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -71,37 +71,26 @@ def bop(
     """
     from posecore.errors import ConfigError
 
-    from synthgen.bop import dataset_writer
     from synthgen.bop.frame_maker import FramePlan
     from synthgen.config import load_config
+    from synthgen.run.bop import BopJob, render_bop_dataset
 
     start_logging(verbose)
     if not sequence and (sequences is not None or fps is not None):
-        raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: only sequences have it; add --sequence")
+        raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: is for sequences alone; add --sequence")
     if objects_per_frame is not None:
         overrides = (*overrides, f"frames.objects=[{objects_per_frame[0]}, {objects_per_frame[1]}]")
     if fps is not None:
         overrides = (*overrides, f"sequence.fps={fps}")
-    config = load_config(preset, overrides, values)
     plan = FramePlan(
         split=split,
         frames=frames,
         frames_per_scene=frames_per_scene,
         sequences=(sequences or 1) if sequence else None,
     )
-    meshes, assets = sources.meshes(), sources.assets()
-    infos = sources.infos(meshes)
-    total = sum(count for _, count in plan.scenes())
+    config = load_config(preset, overrides, values)
+    job = BopJob(out=out, plan=plan, config=config, sources=sources, workers=workers)
     with stoppable(out), progress_bar(quiet) as bar:
-        task = bar.add_task("frames", total=total)
-        dataset_writer.write_dataset(
-            out,
-            config,
-            meshes,
-            plan,
-            assets=assets,
-            infos=infos,
-            workers=workers,
-            on_frame=lambda scene_id, im_id: bar.advance(task),
-        )
-    click.echo(f"{out}: complete, {total} frames", err=True)
+        task = bar.add_task("frames", total=job.frames)
+        summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.advance(task))
+    click.echo(summary.text, err=True)

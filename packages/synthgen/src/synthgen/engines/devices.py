@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from posecore.errors import RenderError
 
-from synthgen.engine import GPU_DEVICES, Device
+from synthgen.names import GPU_DEVICES, Device
 
 _LISTING_TIMEOUT_S = 180  # the first start on a machine with GPUs may load their drivers
 

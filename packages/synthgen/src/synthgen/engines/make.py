@@ -2,7 +2,8 @@
 
 from posecore.errors import ConfigError
 
-from synthgen.engine import ENGINE_NAMES, Device, Engine
+from synthgen.engine import Engine
+from synthgen.names import ENGINE_NAMES, Device
 
 
 def make_engine(name: str, *, threads: int = 0, device: Device = "cpu") -> Engine:

@@ -1,6 +1,7 @@
 """Contact sheets: what the samples of a dataset look like, with their labels drawn over them."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,7 +9,8 @@ from jaxtyping import Float, UInt8
 from posecore import se3
 from posecore.camera import project
 from posecore.contour import contour_mask
-from posecore.errors import ShardError
+from posecore.errors import ConfigError, ShardError
+from posecore.files import write_atomic
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
 
 Array = np.ndarray
@@ -52,6 +54,26 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         rendered = sum(map(reader.n_samples, reader.committed))
         raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
     return np.concatenate([title_row(), *rows])
+
+
+def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> tuple[int, int]:
+    """Write a contact sheet as a picture; see `contact_sheet`.
+
+    Returns:
+        Width and height, pixels.
+
+    Raises:
+        ConfigError: The file's name does not end in .png or .jpg.
+        ShardError: Nothing to show.
+        StorageError: The file cannot be written.
+    """
+    if file.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ConfigError(f"--out {file}: expected a .png or .jpg file")
+    sheet = contact_sheet(url, count, first=first)
+    ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
+    assert ok
+    write_atomic(file, data.tobytes())
+    return sheet.shape[1], sheet.shape[0]
 
 
 def sample_row(sample: Mapping[str, Array], index: int) -> Image:

@@ -14,6 +14,7 @@ from posecore.shard import GROUP, ShardReader, ShardWriter, field_table
 from posecore.store import open_store
 
 from synthgen.inspect.preview import sample_row, title_row
+from synthgen.run.render import RenderJob, shard_job
 from synthgen.run.shard_job import ShardJob, ShardRenderer
 from synthgen.verify.facts import manifest_lines
 
@@ -153,15 +154,15 @@ def _difference(name: str, stored: Array, made: Array) -> str:
     return f"{name} ({int((gap != 0).sum())} of {gap.size} values, by up to {np.nanmax(gap):.4g}{said})"
 
 
-def run_only(url: str, job: ShardJob, index: int, save: Path | None) -> Reproduction:
-    """Make one sample again for the command line, and save it when asked to.
+def reproduce_sample(job: RenderJob, index: int, save: Path | None = None) -> Reproduction:
+    """Render one sample of a job again, compare it with the stored one, and save it on request.
 
     Raises:
-        ShardError: Nothing is stored to compare it with, and it is not to be saved either; or see `reproduce`.
+        ShardError: Nothing is stored to compare with and nothing is to be saved; or see `reproduce`.
     """
     if save is not None:
         check_suffix(save)
-    made = reproduce(url, job, index, must_compare=save is None)
+    reproduction = reproduce(job.out, shard_job(job), index, must_compare=save is None)
     if save is not None:
-        save_sample(save, made)
-    return made
+        save_sample(save, reproduction)
+    return reproduction

@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import h5py
@@ -24,6 +24,7 @@ from synthgen.machine import free_bytes
 
 Array = np.ndarray
 OnShard = Callable[[int], None]
+Layout = Literal["hdf5", "webdataset"]
 
 ALIASES = {"colors": "scene_rgb", "depth": "scene_depth_m"}
 """BlenderProc's keys in an HDF5 file, and the fields that they are further names of."""
@@ -38,6 +39,39 @@ SUFFIXES = (".h5", ".hdf5")
 _ROWS_TOGETHER = 1024  # of fields that are no patches
 _SPARE_BYTES = 16 * 2**20  # for HDF5's own tables
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+
+
+def export_dataset(
+    url: str,
+    out: Path,
+    layout: Layout,
+    *,
+    overwrite: bool = False,
+    on_start: OnShard = lambda n: None,
+    on_shard: OnShard = lambda n: None,
+) -> int:
+    """Write a complete dataset in another container; see `to_hdf5` and `to_webdataset`.
+
+    Args:
+        url: Dataset.
+        out: File or folder.
+        layout: Container.
+        overwrite: Replace an existing `out`.
+        on_start: Called with the number of samples of the dataset.
+        on_shard: Called with the number of samples of each written shard.
+
+    Returns:
+        The number of samples.
+
+    Raises:
+        ShardError, ConfigError, StorageError: See `to_hdf5`.
+    """
+    refuse_existing(out, overwrite)
+    n = ShardReader(url).n
+    on_start(n)
+    write = to_hdf5 if layout == "hdf5" else to_webdataset
+    write(url, out, overwrite=overwrite, on_shard=on_shard)
+    return n
 
 
 def to_hdf5(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard = lambda n: None) -> None:

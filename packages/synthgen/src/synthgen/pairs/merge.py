@@ -10,12 +10,44 @@ from posecore.errors import ShardError
 from posecore.mesh import mesh_digest
 from posecore.shard import ShardReader, ShardWriter, load_meshes
 
+from synthgen import lock
 from synthgen.pairs.export import complete_dataset, model_keys
 
 Array = np.ndarray
 MODELS_INFO = "models/models_info.json"
 _SAME = ("schema", "schema_version", "patch_px", "contour_points", "units")
 _CAMERA = ("width_px", "height_px", "fx", "fy", "cx", "cy")
+
+
+def merge_datasets(
+    urls: Sequence[str],
+    out: str,
+    *,
+    on_start: Callable[[int], None] = lambda pairs: None,
+    on_shard: Callable[[int], None] = lambda pairs: None,
+) -> int:
+    """Merge datasets into a new one, or continue an unfinished merge of the same datasets.
+
+    Args:
+        urls: Complete datasets.
+        out: Folder or fsspec URL.
+        on_start: Called with the number of pairs of all datasets before the first shard.
+        on_shard: Called with the number of pairs of each shard, earlier ones included.
+
+    Returns:
+        The number of pairs.
+
+    Raises:
+        ShardError: See `open_parts`; or the folder holds another dataset.
+        StorageError: The dataset cannot be written, or another process writes it.
+    """
+    parts = open_parts(urls)
+    card = merged_card(parts)
+    with lock.held(out):
+        writer = ShardWriter.create(out, card)
+        on_start(card["n"])
+        write_merged(parts, writer, on_shard)
+    return int(card["n"])
 
 
 def open_parts(urls: Sequence[str]) -> list[ShardReader]:

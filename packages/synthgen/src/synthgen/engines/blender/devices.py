@@ -6,8 +6,8 @@ from typing import Any
 
 import bpy
 
-from synthgen.engine import GPU_DEVICES, Device
 from synthgen.engines.blender.quiet import blender_output_caught
+from synthgen.names import GPU_DEVICES, Device
 
 
 def gpu_counts() -> dict[Device, int]:

@@ -17,7 +17,7 @@ except ImportError as error:
         "it names, or use the engine raster"
     ) from error
 
-from synthgen.engine import Device, RenderedScene
+from synthgen.engine import RenderedScene
 from synthgen.engines.blender import scratch
 from synthgen.engines.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_of, occupied_region
 from synthgen.engines.blender.exr import read_channels
@@ -27,6 +27,7 @@ from synthgen.engines.blender.objects import Props
 from synthgen.engines.blender.quiet import blender_output_caught
 from synthgen.engines.blender.settings import ENGINE_IDS, set_common, set_cycles, set_eevee
 from synthgen.image.hdri import with_lamps, with_suns
+from synthgen.names import Device
 from synthgen.scene import Scene
 
 Channels = dict[str, Float[np.ndarray, "h w"]]

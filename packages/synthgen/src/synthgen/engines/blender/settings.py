@@ -2,10 +2,10 @@
 
 import bpy
 
-from synthgen.engine import Device
 from synthgen.engines.blender.devices import gpu_counts, use_gpus
 from synthgen.engines.blender.materials import INDEX_AOV
 from synthgen.engines.devices import choose_device
+from synthgen.names import Device
 
 ENGINE_IDS = {"cycles": "CYCLES", "eevee": "BLENDER_EEVEE_NEXT"}
 COLOUR_FILTER_PX = 1.5
