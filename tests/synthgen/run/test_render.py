@@ -1,6 +1,7 @@
 """The applications behind `render`, `bop` and `cut`, called from Python with one job."""
 
 import json
+import shutil
 
 import pytest
 from posecore.errors import ConfigError
@@ -60,6 +61,6 @@ def test_a_bop_job_and_a_cut_job_make_pairs_of_its_images(sources, config_of, tm
     plans, pairs = [], []
     cut = cut_dataset(job, on_plan=plans.append, on_shard=pairs.append)
     assert cut.pairs == plans[0].pairs == sum(pairs) == ShardReader(job.out).n > 0
-    (tmp_path / "frames/val").mkdir()
+    shutil.copytree(tmp_path / "frames/test", tmp_path / "frames/val")
     with pytest.raises(ConfigError, match="has the splits test, val: choose with --split"):
         cut_dataset(job)

@@ -64,17 +64,13 @@ def cut(
     synthgen cut my_images --out shards --hypotheses detections.csv
     synthgen cut my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
     """
-    from posecore import config as config_tools
-
-    from synthgen.config import CutConfig
+    from synthgen.config import load_cut_config
     from synthgen.run.cut import CutJob, cut_dataset
 
-    options = {key: value for key, value in values.items() if value is not None}
-    config = config_tools.build(CutConfig, config_tools.apply_overrides({}, overrides) | options, "settings")
     job = CutJob(
         dataset=dataset,
         out=out,
-        config=config,
+        config=load_cut_config(overrides, values),
         split=split,
         sensor=sensor,
         hypotheses=hypotheses,

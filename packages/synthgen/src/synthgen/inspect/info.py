@@ -10,7 +10,8 @@ from posecore.errors import DatasetError
 from posecore.shard import ShardReader, n_shards
 
 from synthgen.bop.dataset_writer import CARD as BOP_CARD
-from synthgen.config import CutConfig, load_config
+from synthgen.config import CutConfig, load_config, migrate
+from synthgen.pairs.data_card import migrated_card
 from synthgen.verify.facts import manifest_lines
 
 _ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # and what is counted of each
@@ -27,7 +28,7 @@ def dataset_info(url: str) -> dict[str, Any]:
     if "://" not in url and (Path(url) / BOP_CARD).is_file():
         return _bop_info(Path(url))
     reader = ShardReader(url)
-    card, lines = reader.card, manifest_lines(reader)
+    card, lines = migrated_card(reader.card), manifest_lines(reader)
     pairs = sum(map(reader.n_samples, reader.committed))
     sizes: dict[str, int] = {}
     for line in lines.values():
@@ -137,7 +138,7 @@ def _bop_info(folder: Path) -> dict[str, Any]:
             "split": card["split"],
             "frames": card["frames"],
             "sequences": card["sequences"],
-            "changed_keys": changed_keys(config),
+            "changed_keys": changed_keys(migrate(config)),
             "card": {"objects": card["objects"], "camera": config["camera"], "seed": config["seed"]},
             "assets": {name: card.get(name) for name in _ASSETS},
             "versions": card["versions"],

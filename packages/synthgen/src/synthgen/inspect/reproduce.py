@@ -14,6 +14,7 @@ from posecore.shard import GROUP, ShardReader, ShardWriter, field_table
 from posecore.store import open_store
 
 from synthgen.inspect.preview import sample_row, title_row
+from synthgen.pairs.data_card import create_writer
 from synthgen.run.render import RenderJob, shard_job
 from synthgen.run.shard_job import ShardJob, ShardRenderer
 from synthgen.verify.facts import manifest_lines
@@ -124,7 +125,7 @@ def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, Array] | 
     """The stored shard, or why there is none, and its scenes in quarantine."""
     if open_store(url).get(GROUP) is None:
         return None, f"there is no dataset at {url}", frozenset()
-    ShardWriter.create(url, job.card)  # refuses another dataset as a resumed run does; writes nothing where one is
+    create_writer(url, job.card)  # refuses another dataset as a resumed run does; writes nothing where one is
     reader = ShardReader(url)
     if shard_id not in reader.committed:
         return None, f"its shard {shard_id} is not rendered yet", frozenset()

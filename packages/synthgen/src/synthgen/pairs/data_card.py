@@ -1,7 +1,9 @@
 """Data cards of pair datasets, rendered or cut from images, and the model files beside their shards."""
 
+import json
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import PackageNotFoundError
+from importlib.metadata import version as package_version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,8 +13,12 @@ from posecore import config as config_tools
 from posecore.bop import BopDataset, ModelInfo, write_models
 from posecore.errors import ConfigError
 from posecore.mesh import Mesh
+from posecore.shard import GROUP, ShardWriter
+from posecore.shard.fields import schema
+from posecore.shard.layout import check_same_card, read_card
+from posecore.store import open_store
 
-from synthgen.config import CutConfig, SynthConfig
+from synthgen.config import CutConfig, SynthConfig, migrate
 from synthgen.draw.target import Target, make_targets
 from synthgen.inputs.assets import Assets
 from synthgen.pairs.cut_plan import Plan, centre_m
@@ -113,6 +119,34 @@ def _object_entry(obj_id: int, mesh: Mesh, window_side_px: float) -> dict[str, A
     }
 
 
+def migrated_card(card: Mapping[str, Any]) -> dict[str, Any]:
+    """A stored data card with today's configuration keys, its own and those of merged parts."""
+    current = dict(card)
+    for key in ("config", "cut"):
+        if isinstance(card.get(key), Mapping):
+            current[key] = migrate(card[key])
+    if "merged" in card:
+        current["merged"] = [{**part, "card": migrated_card(part["card"])} for part in card["merged"]]
+    return current
+
+
+def create_writer(url: str, card: Mapping[str, Any]) -> ShardWriter:
+    """Create a dataset, or reopen the one with the same card; an earlier version's dataset keeps its stored card.
+
+    Raises:
+        ShardError: The folder holds another dataset; the message has the first key that differs.
+        StorageError: The folder cannot be read or written.
+    """
+    group = open_store(url).get(GROUP)
+    if group is None:
+        return ShardWriter.create(url, card)
+    stored = read_card(url, group)
+    name, version = schema()
+    same = json.loads(json.dumps({"schema": name, "schema_version": version, **card}))
+    check_same_card(url, migrated_card(stored), migrated_card(same))
+    return ShardWriter.create(url, stored)
+
+
 def depth_step_m(targets: Sequence[Target]) -> float:
     """Depth quantisation of the deepest scene of any object, metres."""
     return _depth_step_m(max(t.distance_m[1] + t.reach_m for t in targets))
@@ -152,7 +186,7 @@ def package_versions(further: Sequence[str] = ()) -> dict[str, str]:
     numbers = {}
     for name in (*_PACKAGES, *further):
         try:
-            numbers[name] = version(name)
+            numbers[name] = package_version(name)
         except PackageNotFoundError:  # a checkout on the path
             numbers[name] = "unknown"
     return numbers

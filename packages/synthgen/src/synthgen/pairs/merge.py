@@ -11,6 +11,7 @@ from posecore.mesh import mesh_digest
 from posecore.shard import ShardReader, ShardWriter, load_meshes
 
 from synthgen import lock
+from synthgen.pairs.data_card import create_writer
 from synthgen.pairs.export import complete_dataset, model_keys
 
 Array = np.ndarray
@@ -44,7 +45,7 @@ def merge_datasets(
     parts = open_parts(urls)
     card = merged_card(parts)
     with lock.held(out):
-        writer = ShardWriter.create(out, card)
+        writer = create_writer(out, card)
         on_start(card["n"])
         write_merged(parts, writer, on_shard)
     return int(card["n"])

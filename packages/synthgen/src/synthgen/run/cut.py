@@ -6,14 +6,13 @@ from pathlib import Path
 
 from posecore.bop import BopDataset, splits_of
 from posecore.errors import ConfigError
-from posecore.shard import ShardWriter
 
 from synthgen import lock
 from synthgen.config import CutConfig
 from synthgen.machine import require_free_space, size_text
 from synthgen.pairs import cut_plan
 from synthgen.pairs.cut import cut_pairs
-from synthgen.pairs.data_card import cut_card, estimated_bytes, model_files
+from synthgen.pairs.data_card import create_writer, cut_card, estimated_bytes, model_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +105,7 @@ def cut_dataset(
     images = BopDataset(job.dataset, job.split, job.sensor)
     plan = cut_plan.plan(images, job.config, job.hypotheses)
     with lock.held(job.out):
-        writer = ShardWriter.create(job.out, cut_card(images, plan, job.config, drawn=job.hypotheses is None))
+        writer = create_writer(job.out, cut_card(images, plan, job.config, drawn=job.hypotheses is None))
         missing = plan.n - len(writer.committed()) * job.config.shard_size
         size = estimated_bytes(job.config.patch_px, job.config.contour_points, max(0, missing))
         require_free_space(job.out, size)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from posecore.errors import ConfigError, PoseError, RenderError
-from posecore.shard import Encoded, ShardWriter
+from posecore.shard import Encoded
 from posecore.shard.layout import MANIFEST
 
 from synthgen import lock
@@ -136,7 +136,7 @@ def render_dataset(
     workers = job.workers or len(gpus) or min(MOST_WORKERS, cores())
     new = "://" not in job.out and not Path(job.out).exists()
     with lock.held(job.out), _removed_if_useless(Path(job.out) if new else None):
-        writer = ShardWriter.create(job.out, shards.card)
+        writer = data_card.create_writer(job.out, shards.card)
         for key, data in data_card.model_files(shards.meshes, job.sources.infos(shards.meshes)).items():
             writer.add_file(key, data)
         threads = 1 if job.scheduler else dispatcher.threads_per_worker(workers, cores())

@@ -16,6 +16,7 @@ from posecore.raster import Rasteriser
 from posecore.shard import BIT_OBJECT, MANIFEST, ShardReader, field_table, load_meshes
 
 from synthgen.draw.target import hull
+from synthgen.pairs.data_card import migrated_card
 
 Array = np.ndarray
 
@@ -88,7 +89,7 @@ def load_facts(reader: ShardReader) -> Facts:
         ShardError: A model is missing or broken, the dataset is merged, or the card lacks what those of
             `synthgen render` and `cut` have.
     """
-    card = reader.card
+    card = migrated_card(reader.card)
     if "merged" in card:
         raise ShardError(f"{reader.url}: is merged of {len(card['merged'])} datasets; verify each of those instead")
     try:

@@ -128,7 +128,7 @@ def verify(
     findings += [*_shards(results), *_samples(results, facts), _duplicates(results, reader.shard_size)]
     return Report(
         url=url,
-        card=dict(reader.card),
+        card=dict(facts.card),
         digest=reader.digest,
         committed=sum(map(reader.n_samples, ids)),
         drawn=sum(map(len, drawn.values())),
