@@ -84,7 +84,7 @@ def test_every_check_of_a_dataset_passes(images, window, tmp_path):
     report = verify(str(tmp_path / "shards"))
     assert [f.name for f in report.findings if not f.ok] == []
     checked = {f.name: f.covered for f in report.findings}
-    assert checked["truth drawn again"] == report.committed >= 12
+    assert checked["ground truth re-rendered"] == report.committed >= 12
     assert "angle" not in checked
     page = report_page(report)
     assert f"3 of {images.name}, split test" in page
@@ -431,7 +431,7 @@ def test_from_the_command_line(images, tmp_path):
     shutil.copytree(images.split_path, tmp_path / "two" / "train")
     unsure = CliRunner().invoke(main, ["cut", str(tmp_path / "two"), "--out", str(tmp_path / "x")])
     assert unsure.exit_code == 2
-    assert "has the splits test, train: name one with --split" in unsure.output
+    assert "has the splits test, train: choose with --split" in unsure.output
     failed = CliRunner().invoke(main, ["cut", str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")])
     assert failed.exit_code == 1
     assert "no such folder" in failed.output

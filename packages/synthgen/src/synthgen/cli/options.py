@@ -13,7 +13,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 UNITS = click.Choice(["mm", "cm", "m"])
 ENGINE = click.Choice(ENGINE_NAMES)
-FOLDER = click.Path(path_type=Path)
+PATH = click.Path(path_type=Path)
 OUT = click.option(
     "--out", required=True, type=str, metavar="DIR", help="Dataset to write; the same command again continues it."
 )
@@ -36,7 +36,7 @@ _SCENE_OPTIONS = (
         "objects",
         required=True,
         multiple=True,
-        type=FOLDER,
+        type=PATH,
         metavar="MESH|DIR",
         help="Mesh of the object (.ply, .obj, .gltf, .glb, .stl), a folder of meshes, or a BOP models folder. "
         "Repeatable: each scene shows a single object, all equally often. Files named obj_000005.ply keep their "
@@ -62,22 +62,22 @@ _SCENE_OPTIONS = (
     click.option("--samples", type=click.IntRange(1), help="Light paths per pixel (Blender engines). [preset]"),
     click.option(
         "--backgrounds",
-        type=FOLDER,
+        type=PATH,
         metavar="DIR",
         help="Folder of photographs for backgrounds and tables. [procedural backgrounds]",
     ),
     click.option(
-        "--hdris", type=FOLDER, metavar="DIR", help="Folder of panoramas (.hdr, .exr) that light scenes. [lamps only]"
+        "--hdris", type=PATH, metavar="DIR", help="Folder of panoramas (.hdr, .exr) that light scenes. [lamps only]"
     ),
     click.option(
         "--occluders",
-        type=FOLDER,
+        type=PATH,
         metavar="DIR",
         help="Folder of meshes that hide the object and lie around it, in --units. [primitive shapes]",
     ),
     click.option(
         "--models-info",
-        type=FOLDER,
+        type=PATH,
         metavar="FILE",
         help="BOP models_info.json with symmetries; its keys are object ids or mesh names. [the files in or beside "
         "--object]",
