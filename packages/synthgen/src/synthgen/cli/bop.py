@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, start_logging, stoppable
-from synthgen.cli.options import scene_options
+from synthgen.cli.options import resumable, scene_options
 
 if TYPE_CHECKING:
     from synthgen.bop.frame_maker import Split
@@ -53,7 +53,6 @@ def bop(
     preset: str,
     overrides: tuple[str, ...],
     quiet: bool,
-    verbose: bool,
     **values: Any,
 ) -> None:
     """Render whole camera images, or tracking sequences, with ground truth as a BOP dataset.
@@ -75,7 +74,6 @@ def bop(
     from synthgen.config import load_config
     from synthgen.run.bop import BopJob, render_bop_dataset
 
-    start_logging(verbose)
     if not sequence and (sequences is not None or fps is not None):
         raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: is for sequences alone; add --sequence")
     if objects_per_frame is not None:
@@ -90,7 +88,7 @@ def bop(
     )
     config = load_config(preset, overrides, values)
     job = BopJob(out=out, plan=plan, config=config, sources=sources, workers=workers)
-    with stoppable(out), progress_bar(quiet) as bar:
+    with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("frames", total=job.frames)
         summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.advance(task))
     click.echo(summary.text, err=True)

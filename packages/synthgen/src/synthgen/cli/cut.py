@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, stoppable
-from synthgen.cli.options import OUT, QUIET
+from synthgen.cli.options import OUT, QUIET, resumable
 
 if TYPE_CHECKING:
     from synthgen.run.cut import CutWork
@@ -76,7 +76,7 @@ def cut(
         hypotheses=hypotheses,
         workers=workers,
     )
-    with stoppable(out), progress_bar(quiet) as bar:
+    with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("pairs", visible=False)
 
         def on_plan(plan: "CutWork") -> None:

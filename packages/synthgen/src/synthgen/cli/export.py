@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar
 from synthgen.cli.options import QUIET
 
 if TYPE_CHECKING:

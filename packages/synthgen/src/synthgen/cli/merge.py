@@ -1,9 +1,9 @@
 """`synthgen merge`."""
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, stoppable
-from synthgen.cli.options import OUT, QUIET
+from synthgen.cli.options import OUT, QUIET, resumable
 
 
 @click.command()
@@ -24,7 +24,7 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
         raise click.UsageError("give two datasets or more")
     from synthgen.pairs.merge import merge_datasets
 
-    with stoppable(out), progress_bar(quiet) as bar:
+    with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("pairs", visible=False)
         pairs = merge_datasets(
             datasets,

@@ -2,10 +2,12 @@
 
 import functools
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from posecore.command_line import stoppable, verbose_option
 
 from synthgen.names import ENGINE_NAMES
 
@@ -91,7 +93,7 @@ _SCENE_OPTIONS = (
         "--skip-bad-objects", is_flag=True, help="Leave out objects that cannot be loaded, with a line for each."
     ),
     QUIET,
-    click.option("--verbose", is_flag=True, help="Log details to stderr."),
+    verbose_option("synthgen"),
 )
 
 
@@ -108,3 +110,8 @@ def scene_options(command: F) -> F:
     for option in reversed(_SCENE_OPTIONS):
         wrapped = option(wrapped)
     return wrapped
+
+
+def resumable(out: str) -> AbstractContextManager[None]:
+    """End Ctrl-C with one line: finished parts stay in `out`, and the same command continues there."""
+    return stoppable(lambda: f"what is rendered stays in {out}; the same command again continues")

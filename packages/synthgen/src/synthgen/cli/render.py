@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, start_logging, stoppable
-from synthgen.cli.options import ENGINE, scene_options
+from synthgen.cli.options import ENGINE, resumable, scene_options
 from synthgen.names import DEVICES
 
 if TYPE_CHECKING:
@@ -57,7 +57,6 @@ def render(
     preset: str,
     overrides: tuple[str, ...],
     quiet: bool,
-    verbose: bool,
     workers: int | None,
     scheduler: str | None,
     shard_timeout: float | None,
@@ -85,7 +84,6 @@ def render(
 
     if save is not None and only is None:
         raise click.UsageError("--save writes the sample of --only: add --only")
-    start_logging(verbose)
     job = RenderJob(
         out=out,
         n=n,
@@ -98,7 +96,7 @@ def render(
     if only is not None:
         _reproduce(job, only, save)
         return
-    with stoppable(out), progress_bar(quiet) as bar:
+    with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("pairs", visible=False)
 
         def on_plan(plan: "RenderPlan") -> None:

@@ -4,8 +4,8 @@ import sys
 from pathlib import Path
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar
 from synthgen.cli.options import QUIET
 
 

@@ -12,7 +12,6 @@ from posecore.shard import ShardReader, n_shards
 from synthgen.bop.dataset_writer import CARD as BOP_CARD
 from synthgen.config import CutConfig, load_config, migrate
 from synthgen.pairs.data_card import migrated_card
-from synthgen.verify.facts import manifest_lines
 
 _ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # and what is counted of each
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy")
@@ -28,7 +27,7 @@ def dataset_info(url: str) -> dict[str, Any]:
     if "://" not in url and (Path(url) / BOP_CARD).is_file():
         return _bop_info(Path(url))
     reader = ShardReader(url)
-    card, lines = migrated_card(reader.card), manifest_lines(reader)
+    card, lines = migrated_card(reader.card), reader.manifest_lines
     pairs = sum(map(reader.n_samples, reader.committed))
     sizes: dict[str, int] = {}
     for line in lines.values():

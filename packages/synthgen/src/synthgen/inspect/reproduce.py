@@ -17,7 +17,6 @@ from synthgen.inspect.preview import sample_row, title_row
 from synthgen.pairs.data_card import create_writer
 from synthgen.run.render import RenderJob, shard_job
 from synthgen.run.shard_job import ShardJob, ShardRenderer
-from synthgen.verify.facts import manifest_lines
 
 Array = np.ndarray
 
@@ -129,7 +128,7 @@ def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, Array] | 
     reader = ShardReader(url)
     if shard_id not in reader.committed:
         return None, f"its shard {shard_id} is not rendered yet", frozenset()
-    line = manifest_lines(reader)[shard_id]
+    line = reader.manifest_lines[shard_id]
     return reader.read(shard_id), "", frozenset(line.get("quarantined", ()))
 
 

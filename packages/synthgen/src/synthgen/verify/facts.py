@@ -1,6 +1,5 @@
 """Reference data of the checks: the data card, the objects beside the shards, and samples with derived masks."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,7 +12,7 @@ from posecore.contour import contour_mask
 from posecore.errors import RenderError, ShardError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.shard import BIT_OBJECT, MANIFEST, ShardReader, field_table, load_meshes
+from posecore.shard import BIT_OBJECT, ShardReader, field_table, load_meshes
 
 from synthgen.draw.target import hull
 from synthgen.pairs.data_card import migrated_card
@@ -111,12 +110,6 @@ def load_facts(reader: ShardReader) -> Facts:
     return Facts(
         card=card, meshes=meshes, hulls_m={obj_id: hull(mesh) for obj_id, mesh in meshes.items()}, camera=whole
     )
-
-
-def manifest_lines(reader: ShardReader) -> dict[int, dict[str, Any]]:
-    """The manifest's lines by shard, as the reader has checked them."""
-    lines = [json.loads(text) for text in reader.file(MANIFEST).decode().splitlines()] if reader.committed else []
-    return {int(line["shard"]): line for line in lines}
 
 
 class SampleBatch:

@@ -17,7 +17,7 @@ from synthgen.pairs.pair_maker import limit_threads
 from synthgen.verify.check import Check
 from synthgen.verify.checks import CHECKS
 from synthgen.verify.coverage import Coverage, joined, measure_coverage
-from synthgen.verify.facts import Facts, SampleBatch, load_facts, manifest_lines
+from synthgen.verify.facts import Facts, SampleBatch, load_facts
 from synthgen.verify.findings import FIRST, Finding, VerificationReport, dataset_finding, tolerance_text
 
 Array = np.ndarray
@@ -45,7 +45,7 @@ class ShardVerifier:
     def __init__(self, url: str) -> None:
         self.reader = ShardReader(url)
         self.facts = load_facts(self.reader)
-        self._lines = manifest_lines(self.reader)
+        self._lines = self.reader.manifest_lines
         self._rasteriser: Rasteriser | None = None
 
     def verify(self, shard_id: int, rerendered: Sequence[int]) -> ShardResult:
