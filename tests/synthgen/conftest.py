@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from posecore.mesh import Mesh, load_mesh
 from synthgen.config import SynthConfig, load_config
-from synthgen.draw.target import Target, make_target
+from synthgen.draw.target import TargetObject, make_target
 from synthgen.pairs.pair_maker import PairMaker
 
 SMALL = (
@@ -42,7 +42,7 @@ def tug(tug_ply: Path) -> Mesh:
 
 
 @pytest.fixture(scope="session")
-def tug_target(tug: Mesh, config_of: ConfigOf) -> Target:
+def tug_target(tug: Mesh, config_of: ConfigOf) -> TargetObject:
     """The example object, prepared."""
     return make_target(1, tug, config_of())
 

@@ -5,8 +5,10 @@ import pytest
 from posecore import se3
 from posecore.camera import project
 from posecore.mesh import load_mesh
-from synthgen.bop.layout import Balls, ceiling_lights, clearance_m, draw_camera, draw_layout, level_view
+from synthgen.bop.layout import BoundingSpheres, clearance_m, draw_camera, draw_layout
 from synthgen.draw import scene_draw
+from synthgen.draw.appearance import draw_ceiling_lights
+from synthgen.draw.poses import level_rotation
 from synthgen.draw.random_streams import Purpose
 from synthgen.draw.target import make_targets
 from synthgen.inputs.assets import Assets
@@ -39,11 +41,11 @@ def test_floating_objects_keep_apart(layouts, together):
     several = 0
     for base, layout in made:
         shapes = base.target.shapes
-        balls = Balls({**{i: t.mesh for i, t in targets.items()}, **shapes})
+        spheres = BoundingSpheres({**{i: t.mesh for i, t in targets.items()}, **shapes})
         for i, placed in enumerate(layout.labelled[1:], 1):
-            centre, radius = balls.of(placed)
+            centre, radius = spheres.sphere(placed)
             for other in (*layout.labelled[:i], *layout.others):
-                c, r = balls.of(other)
+                c, r = spheres.sphere(other)
                 assert np.linalg.norm(centre - c) >= radius + r
         ids = [o.mesh_key for o in layout.labelled]
         assert max(ids.count(1), ids.count(4)) <= 3
@@ -99,7 +101,7 @@ def test_cameras_look_at_an_object_from_its_distances(layouts):
 
 
 def test_a_level_camera_sees_up_upwards():
-    R = level_view(math.radians(40), 1.0, 0.0)
+    R = level_rotation(math.radians(40), 1.0, 0.0)
     up = R @ np.array([0.0, 0.0, 1.0])
     assert up[1] < 0 and abs(up[0]) < 1e-12
     assert np.allclose(
@@ -110,7 +112,7 @@ def test_a_level_camera_sees_up_upwards():
 def test_the_ceiling_lamp_hangs_over_the_table(layouts):
     config, _, made = layouts("scene.kind=tabletop", count=1)
     T = made[0][1].T_ref_level
-    lights, ambient = ceiling_lights(np.random.default_rng(0), config.lights, T, T[:3, 3], 0.1)
+    lights, ambient = draw_ceiling_lights(np.random.default_rng(0), config.lights, T, T[:3, 3], 0.1)
     area, point = lights
     above = se3.apply(se3.inverse(T), np.array([area.position_cam_m, point.position_cam_m]))
     assert np.allclose(above[0, :2], 0, atol=1e-9) and above[0, 2] > above[1, 2] > 0
@@ -123,8 +125,8 @@ def test_the_ceiling_lamp_hangs_over_the_table(layouts):
 def test_clearance_is_to_the_nearest_ball(layouts):
     _, targets, made = layouts(count=1)
     layout = made[0][1]
-    balls = Balls({i: t.mesh for i, t in targets.items()})
-    centre, radius = balls.of(layout.labelled[0])
+    spheres = BoundingSpheres({i: t.mesh for i, t in targets.items()})
+    centre, radius = spheres.sphere(layout.labelled[0])
     T = se3.make_T(np.eye(3), -centre + [0, 0, 3 * radius])
-    assert clearance_m(balls, layout.labelled[:1], T) == pytest.approx(2 * radius)
-    assert clearance_m(balls, (), T) == math.inf
+    assert clearance_m(spheres, layout.labelled[:1], T) == pytest.approx(2 * radius)
+    assert clearance_m(spheres, (), T) == math.inf

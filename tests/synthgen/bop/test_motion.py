@@ -4,8 +4,8 @@ from posecore import se3
 from posecore.camera import project
 from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
-from synthgen.bop.layout import Balls
-from synthgen.bop.motion import draw_turn, draw_wave
+from synthgen.bop.layout import BoundingSpheres
+from synthgen.bop.motion import draw_rotation, draw_wave
 from synthgen.draw.target import make_targets
 from synthgen.inputs.assets import Assets
 
@@ -29,7 +29,7 @@ def test_waves_keep_their_bounds():
 
 def test_turns_keep_their_speed():
     for seed in range(5):
-        turn = draw_turn(np.random.default_rng(seed), np.pi, 1.2, 2.0)
+        turn = draw_rotation(np.random.default_rng(seed), np.pi, 1.2, 2.0)
         R = np.stack([turn(i / 100) for i in range(800)])
         step = se3.rotation_angle_rad(R[1:] @ R[:-1].swapaxes(-1, -2))
         assert step.max() * 100 <= 1.2 + 1e-6
@@ -77,7 +77,7 @@ def test_the_first_object_stays_in_the_image_at_its_distances(filmed):
 def test_nothing_touches_and_a_shape_passes_before_the_object(filmed):
     config, target, views = filmed
     meshes = {1: target.mesh, **target.shapes, **target.tables}
-    balls, camera = Balls(meshes), config.camera.camera()
+    spheres, camera = BoundingSpheres(meshes), config.camera.camera()
     still = len(views[0].layout.others) - 1
     before = 0
     for view in views:
@@ -88,11 +88,12 @@ def test_nothing_touches_and_a_shape_passes_before_the_object(filmed):
             things = [*layout.labelled[:1], *passing]  # what lies there keeps apart seen from above: see test_frames
         for i, a in enumerate(things):
             for b in things[:i]:
-                (c, r), (d, s) = balls.of(a), balls.of(b)
+                (c, r), (d, s) = spheres.sphere(a), spheres.sphere(b)
                 assert np.linalg.norm(c - d) >= r + s - 1e-9
         for shape in passing:
             ends = [
-                view.T_cam_ref[:3, :3] @ balls.of(o)[0] + view.T_cam_ref[:3, 3] for o in (shape, layout.labelled[0])
+                view.T_cam_ref[:3, :3] @ spheres.sphere(o)[0] + view.T_cam_ref[:3, 3]
+                for o in (shape, layout.labelled[0])
             ]
             apart = np.linalg.norm(np.diff(project(camera.K, np.stack(ends)), axis=0))
             before += apart < 60 and ends[0][2] < ends[1][2]

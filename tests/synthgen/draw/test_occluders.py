@@ -3,7 +3,8 @@ import pytest
 from blender_scenes import box
 from posecore.errors import ConfigError
 from synthgen.config import OccluderConfig
-from synthgen.draw import occluders, scene_draw
+from synthgen.draw import occluders
+from synthgen.draw.poses import target_box
 from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.draw.target import make_target
 from synthgen.inputs.assets import Assets
@@ -11,8 +12,8 @@ from synthgen.inputs.assets import Assets
 
 def test_shapes_have_the_asked_sizes_and_repeat():
     config = OccluderConfig(library=12, size_diameter=(0.5, 0.8))
-    shapes = occluders.library(config, seed=3, obj_id=1, diameter_m=0.2)
-    again = occluders.library(config, seed=3, obj_id=1, diameter_m=0.2)
+    shapes = occluders.primitive_shapes(config, seed=3, obj_id=1, diameter_m=0.2)
+    again = occluders.primitive_shapes(config, seed=3, obj_id=1, diameter_m=0.2)
     assert len(shapes) == 12
     for shape, twin in zip(shapes, again, strict=True):
         assert 0.1 - 1e-9 <= shape.diameter_m <= 0.16 + 1e-9
@@ -20,12 +21,12 @@ def test_shapes_have_the_asked_sizes_and_repeat():
         np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1, atol=1e-3)
         assert np.array_equal(shape.vertices_m, twin.vertices_m)
         assert np.array_equal(shape.vertex_rgb, twin.vertex_rgb)
-    other = occluders.library(config, seed=4, obj_id=1, diameter_m=0.2)
+    other = occluders.primitive_shapes(config, seed=4, obj_id=1, diameter_m=0.2)
     assert any(a.diameter_m != b.diameter_m for a, b in zip(shapes, other, strict=True))
 
 
 def test_normals_point_outwards():
-    for shape in occluders.library(OccluderConfig(library=6), seed=0, obj_id=1, diameter_m=1.0):
+    for shape in occluders.primitive_shapes(OccluderConfig(library=6), seed=0, obj_id=1, diameter_m=1.0):
         corners = shape.vertices_m[shape.faces]
         face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         vertex_normals = shape.normals[shape.faces].mean(axis=1)
@@ -41,7 +42,7 @@ def test_shapes_stand_where_they_should_and_touch_nothing(tug_target, front, pro
     centre, diameter = np.array([0.05, -0.02, 0.8]), tug_target.mesh.diameter_m
     for i in range(60):
         rng = stream(0, Purpose.PAIRS, Subject.OCCLUDERS, i)
-        in_front, around = occluders.place(rng, config, tug_target.shapes, centre, diameter)
+        in_front, around = occluders.draw_occluders(rng, config, tug_target.shapes, centre, diameter)
         assert (len(in_front), len(around)) == (front[0], props[0])
         placed = (*in_front, *around)
         for item in placed:
@@ -72,7 +73,7 @@ def test_a_wanted_visible_share_is_met(maker_of):
     for i in range(60):
         draw, attempt = maker.accepted_scene(i)
         wanted.append(stream(0, Purpose.PAIRS, Subject.VISIBILITY, i, attempt).uniform(0.3, 0.9))
-        seen.append(maker._visible(scene_draw.target_box(draw.target, maker.camera, draw.T_cam_obj), draw))
+        seen.append(maker._visible_fraction(target_box(draw.target, maker.camera, draw.T_cam_obj), draw))
     off = np.abs(np.array(seen) - wanted)
     assert np.mean(off <= 0.03) > 0.8  # a thin ring in front may jump over the wanted share
     counts, _ = np.histogram(seen, bins=4, range=(0.28, 0.92))
@@ -96,7 +97,7 @@ def test_meshes_are_scaled_to_the_object_or_left_alone(tug, config_of):
     assert [s.diameter_m for s in own.shapes.values()] == [s.diameter_m for s in clutter]
     rng = np.random.default_rng(0)
     many = OccluderConfig(front=(20, 20), props=(20, 20))
-    front, props = occluders.place(rng, many, own.shapes, np.array([0.0, 0.0, 1.0]), tug.diameter_m)
+    front, props = occluders.draw_occluders(rng, many, own.shapes, np.array([0.0, 0.0, 1.0]), tug.diameter_m)
     assert {own.shapes[o.mesh_key].diameter_m for o in (*front, *props)} == {
         clutter[0].diameter_m,
         clutter[1].diameter_m,

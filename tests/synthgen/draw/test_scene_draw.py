@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from posecore.se3 import rotation_angle_rad
-from synthgen.draw import scene_draw
+from synthgen.draw import appearance, poses, scene_draw
 from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.inputs.assets import Assets
 
@@ -57,7 +57,7 @@ def test_true_poses_keep_distance_and_place(config_of, tug_target):
 
 def test_viewpoints_cover_the_sphere_by_default(config_of, tug_target):
     rng, view, camera = np.random.default_rng(0), config_of().view, config_of().camera.camera()
-    R = np.stack([scene_draw.draw_pose(rng, view, camera, tug_target)[:3, :3] for _ in range(600)])
+    R = np.stack([poses.draw_pose(rng, view, camera, tug_target)[:3, :3] for _ in range(600)])
     assert np.abs(R.mean(axis=0)).max() < 0.1  # uniform on SO(3): every entry has mean 0, deviation 0.58 / sqrt(600)
 
 
@@ -77,7 +77,7 @@ def test_hypotheses_stay_within_their_bounds_and_reach_them(config_of, tug_targe
     angles, lengths = [], []
     for i in range(400):
         rng = stream(0, Purpose.PAIRS, Subject.HYPOTHESIS, i)
-        H = scene_draw.draw_hypothesis(rng, config.perturbation, T, tug_target.mesh)
+        H = poses.draw_hypothesis(rng, config.perturbation, T, tug_target.mesh)
         angles.append(np.degrees(rotation_angle_rad(H[:3, :3] @ T[:3, :3].T)))
         lengths.append(np.linalg.norm(H[:3, :3] @ tug_target.mesh.center_m + H[:3, 3] - centre))
     assert max(angles) <= 30 + 1e-9
@@ -104,19 +104,19 @@ def test_fraction_inside():
     from synthgen.config import CameraConfig
 
     camera = CameraConfig().camera()
-    assert scene_draw.share_inside(np.array([10.0, 10, 20, 20]), camera) == 1.0
-    assert scene_draw.share_inside(np.array([-10.0, 10, 10, 20]), camera) == pytest.approx(0.5)
-    assert scene_draw.share_inside(np.array([-30.0, 10, -10, 20]), camera) == 0.0
-    assert scene_draw.share_inside(np.array([-np.inf, -np.inf, np.inf, np.inf]), camera) == 0.0
+    assert poses.fraction_inside(np.array([10.0, 10, 20, 20]), camera) == 1.0
+    assert poses.fraction_inside(np.array([-10.0, 10, 10, 20]), camera) == pytest.approx(0.5)
+    assert poses.fraction_inside(np.array([-30.0, 10, -10, 20]), camera) == 0.0
+    assert poses.fraction_inside(np.array([-np.inf, -np.inf, np.inf, np.inf]), camera) == 0.0
 
 
 def test_every_prefix_of_scenes_shows_all_objects_equally_often():
     for count in (1, 3, 7):
-        shown = [scene_draw.target_of(5, Purpose.PAIRS, i, count) for i in range(50)]
+        shown = [scene_draw.target_index(5, Purpose.PAIRS, i, count) for i in range(50)]
         for n in range(1, 51):
             times = np.bincount(shown[:n], minlength=count)
             assert times.max() - times.min() <= 1
-    orders = {tuple(scene_draw.target_of(5, Purpose.PAIRS, 7 * b + i, 7) for i in range(7)) for b in range(10)}
+    orders = {tuple(scene_draw.target_index(5, Purpose.PAIRS, 7 * b + i, 7) for i in range(7)) for b in range(10)}
     assert len(orders) > 5
 
 
@@ -143,7 +143,7 @@ def test_materials_have_their_fractions(config_of, tug_target):
     mean = replace(
         config.material, textureless_fraction=1.0, random_colour_fraction=0.0, saturation=(1, 1), value=(1, 1)
     )
-    np.testing.assert_allclose(scene_draw.draw_material(rng, mean, tug_target).base_rgb, tug_target.mean_rgb, atol=1e-6)
+    np.testing.assert_allclose(appearance.draw_material(rng, mean, tug_target).base_rgb, tug_target.mean_rgb, atol=1e-6)
     assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in looks if m.base_rgb is not None)
 
 

@@ -46,7 +46,7 @@ def test_photographs_are_cropped_at_random_without_distortion(tmp_path):
 def test_missing_and_empty_folders_are_named(tmp_path):
     with pytest.raises(ConfigError, match="no such folder"):
         background.list_photos(tmp_path / "none")
-    with pytest.raises(ConfigError, match="no picture"):
+    with pytest.raises(ConfigError, match="no image"):
         background.list_photos(tmp_path)
 
 
@@ -55,7 +55,7 @@ def test_a_broken_photograph_is_named(tmp_path):
 
     cv2.imwrite(str(tmp_path / "good.png"), np.zeros((9, 9, 3), np.uint8))
     (tmp_path / "broken.jpg").write_bytes(b"not a picture")
-    with pytest.raises(ConfigError, match=r"broken\.jpg: not a picture; repair it or take it out"):
+    with pytest.raises(ConfigError, match=r"broken\.jpg: not an image; repair it or remove it"):
         background.list_photos(tmp_path)
     with pytest.raises(ConfigError, match=r"broken\.jpg"):
         background.draw(Background(kind="photo", path=str(tmp_path / "broken.jpg")), 8, 8)
@@ -64,5 +64,5 @@ def test_a_broken_photograph_is_named(tmp_path):
 def test_a_folder_without_readable_photographs_is_named(tmp_path):
     for name in ("a.jpg", "b.png"):
         (tmp_path / name).write_bytes(b"not a picture")
-    with pytest.raises(ConfigError, match=rf"--backgrounds {tmp_path}: none of its 2 pictures is readable"):
+    with pytest.raises(ConfigError, match=rf"--backgrounds {tmp_path}: none of its 2 images is readable"):
         background.list_photos(tmp_path)

@@ -125,17 +125,17 @@ def test_suns_and_what_is_left_light_every_side_as_the_panorama_does(tmp_path):
         row, column = rng.integers(4, 70), rng.integers(4, 250)
         image[row : row + 3, column : column + 4] = rng.uniform(5, 60) * rng.uniform(0.3, 1.0, 3)
     cv2.imwrite(str(tmp_path / "lamps.hdr"), image)
-    light, split = hdri.load(str(tmp_path / "lamps.hdr")).light, hdri.split(str(tmp_path / "lamps.hdr"))
+    light, split = hdri.load(str(tmp_path / "lamps.hdr")).light, hdri.split_light(str(tmp_path / "lamps.hdr"))
     directions, weights = hdri._sphere(*hdri.LIGHT_SIZE_PX)
     assert len(split.suns) == 8
-    assert split.rest.max() < 0.3 * light.max()
+    assert split.residual.max() < 0.3 * light.max()
     for normal in np.concatenate([np.eye(3), -np.eye(3)]):
         facing = (np.maximum(directions @ normal, 0.0) * weights)[..., None]
         whole = (light * facing).sum(axis=(0, 1))
-        got = (split.rest * facing).sum(axis=(0, 1))
+        got = (split.residual * facing).sum(axis=(0, 1))
         got += sum(irradiance * max(towards @ normal, 0.0) for towards, irradiance, _ in split.suns)
         np.testing.assert_allclose(got, whole, rtol=0.16, atol=0.03 * whole.max())
-    left = (split.rest * weights[..., None]).sum(axis=(0, 1)) + sum(sun[1] for sun in split.suns)
+    left = (split.residual * weights[..., None]).sum(axis=(0, 1)) + sum(sun[1] for sun in split.suns)
     np.testing.assert_allclose(left, (light * weights[..., None]).sum(axis=(0, 1)), rtol=1e-4)
 
 
@@ -154,7 +154,7 @@ def test_exr_is_read_like_hdr(tmp_path):
 def test_a_broken_panorama_is_named(tmp_path, name):
     write_hdr(tmp_path / "good.hdr", 30, 20)
     (tmp_path / name).write_bytes(b"#?RADIANCE\nnot a picture")
-    with pytest.raises(ConfigError, match=rf"{name}: does not decode as an HDRI"):
+    with pytest.raises(ConfigError, match=rf"{name}: cannot be decoded as an HDRI"):
         hdri.list_hdris(tmp_path)
 
 
@@ -164,7 +164,7 @@ def test_folders_without_panoramas_and_wrong_shapes_are_named(tmp_path):
     with pytest.raises(ConfigError, match=r"no panorama in it"):
         hdri.list_hdris(tmp_path)
     cv2.imwrite(str(tmp_path / "square.hdr"), np.ones((32, 32, 3), np.float32))
-    with pytest.raises(ConfigError, match=r"square\.hdr: the picture is 32 x 32 px"):
+    with pytest.raises(ConfigError, match=r"square\.hdr: the image is 32 x 32 px"):
         hdri.list_hdris(tmp_path)
 
 
@@ -181,7 +181,7 @@ def sides_of(engine, path, towards_cam, samples=8):
     )
     layers = engine.render(scene)
     lit = layers.rgb_linear * layers.alpha[..., None]
-    return brightest(lit), brightest(background.behind(scene, 64, 64))
+    return brightest(lit), brightest(background.render_background(scene, 64, 64))
 
 
 def check_sides(engine, path):

@@ -14,7 +14,7 @@ LOOK = Material(base_rgb=(1.0, 0.5, 0.0), pattern=PATTERN, roughness=1.0, specul
 def test_bands_repeat_along_the_wave_and_keep_their_bounds():
     straight = Pattern(accent_rgb=(1.0, 1.0, 1.0), wave=(2 * np.pi * 10, 0.0, 0.0), sharpness=8.0)
     x = np.linspace(0, 1, 1000, endpoint=False) + 5e-4
-    share = pattern.share(straight, np.stack([x, 0.3 + 0 * x, 7.0 * x], axis=1))
+    share = pattern.accent_weight(straight, np.stack([x, 0.3 + 0 * x, 7.0 * x], axis=1))
     assert (share.min(), share.max()) == (0.0, 1.0)
     assert share.mean() == pytest.approx(0.5, abs=0.01)
     np.testing.assert_allclose(share[:100], share[300:400], atol=1e-9)
@@ -34,7 +34,7 @@ def test_both_engines_show_the_formula(name):
     v, u = np.nonzero(inside & (layers.index == 0))
     p_cam = back_project(scene.camera.K, np.stack([u, v], -1) + 0.5, layers.depth_m[v, u])
     p_obj = (p_cam - T[:3, 3]) @ T[:3, :3]
-    share = pattern.share(PATTERN, p_obj)[:, None]
+    share = pattern.accent_weight(PATTERN, p_obj)[:, None]
     base = linear_from_display(np.array([[[255, 128, 0]]], np.uint8))[0]
     expected = base * (1 - share) + np.array([0.0, 0.0, 1.0]) * share
     difference = np.abs(layers.rgb_linear[v, u] - expected)

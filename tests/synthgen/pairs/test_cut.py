@@ -112,7 +112,7 @@ def test_a_fixed_window_is_as_large_as_the_nearest_pose_may_need(images, tmp_pat
     assert planned.n == len(there)
     for obj_id, side_px in planned.windows_px.items():
         mesh = planned.meshes[obj_id]
-        z = min(cut_plan.centre_m(gt.T_cam_obj, mesh)[2] for *_, gt in there if gt.obj_id == obj_id)
+        z = min(mesh.center_cam_m(gt.T_cam_obj)[2] for *_, gt in there if gt.obj_id == obj_id)
         across_px = CAMERA["fy"] * mesh.diameter_m / z
         assert 0.8 < side_px / across_px < 1.3
 

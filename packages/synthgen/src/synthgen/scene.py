@@ -1,8 +1,8 @@
-"""A scene as plain data: what an engine is asked to render, with no engine in sight.
+"""Scenes as plain data, independent of the rendering engine.
 
 The camera frame is the world frame (OpenCV axes: x right, y down, z forward), in metres. Every record is frozen,
-checked when it is made and holds nothing but numbers and strings, so that a scene can be pickled to a worker, written
-down, or rendered by two engines and compared.
+checked at construction and holds only numbers and strings, so that a scene can be pickled to a worker, stored, or
+rendered by two engines and compared.
 """
 
 import math
@@ -28,14 +28,14 @@ def _fail(where: str, got: object, expected: str) -> ConfigError:
 
 
 def _number(where: str, value: float, low: float = -math.inf, high: float = math.inf) -> float:
-    """Return the value as a float inside [low, high], or raise ConfigError."""
+    """The value as a float; ConfigError unless it is in [low, high]."""
     if not (math.isfinite(value) and low <= value <= high):
         raise _fail(where, value, f"a finite number in [{low:g}, {high:g}]")
     return float(value)
 
 
 def _vector(where: str, value: Sequence[float], low: float = -math.inf, high: float = math.inf) -> Vector:
-    """Return three checked floats as a tuple, so that records with equal numbers compare equal."""
+    """Three checked floats as a tuple, so that records with equal numbers compare equal."""
     if len(value) != 3:
         raise _fail(where, value, "3 numbers")
     x, y, z = (_number(where, float(v), low, high) for v in value)
@@ -44,16 +44,16 @@ def _vector(where: str, value: Sequence[float], low: float = -math.inf, high: fl
 
 @dataclass(frozen=True, kw_only=True)
 class Pattern:
-    """A procedural texture that fills space: bands, bent by waves across them.
+    """A procedural solid texture: bands, bent by a transverse wave.
 
-    At p, in metres and object coordinates, the share of the accent colour is a smooth step, `sharpness` steep, of
-    sin(wave . p + bend sin(warp . p)). The same formula is evaluated by Blender's nodes and by `pattern.share`.
+    At p, in metres and object coordinates, the weight of the accent colour is a smooth step, `sharpness` steep, of
+    sin(wave . p + bend sin(warp . p)). Blender's nodes and `pattern.accent_weight` evaluate the same formula.
 
     Attributes:
-        accent_rgb: Display (sRGB) colour that stands beside the material's base colour.
+        accent_rgb: Display (sRGB) colour beside the material's base colour.
         wave: Wave vector of the bands, rad/m.
-        warp: Wave vector of what bends them, rad/m.
-        bend: How far it bends them, rad.
+        warp: Wave vector of the bending wave, rad/m.
+        bend: Amplitude of the bending wave, rad.
         sharpness: 1 is a soft wave, 20 has hard edges.
     """
 
@@ -73,11 +73,11 @@ class Pattern:
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """How one object's surface looks.
+    """Surface appearance of one object.
 
     Attributes:
-        base_rgb: Display (sRGB) colour in [0, 1] that replaces the mesh's own colours; None keeps the mesh's own.
-        pattern: Procedural texture between `base_rgb` and another colour; None leaves the base colour plain.
+        base_rgb: Display (sRGB) colour in [0, 1] that replaces the mesh's colours; None keeps them.
+        pattern: Procedural texture between `base_rgb` and another colour; None is plain.
         hue_shift: Rotation of the hue in turns, [-0.5, 0.5].
         saturation: Factor on the saturation, [0, 4].
         value: Factor on the brightness, [0, 4].
@@ -113,7 +113,7 @@ class SceneObject:
     """One mesh placed in the camera's frame.
 
     Attributes:
-        mesh_key: Key of the mesh among those given to `Engine.load`.
+        mesh_key: Key of the mesh in `Engine.load`.
         T_cam_obj: (4, 4) rigid transform, metres; kept as a read-only float64 copy.
         material: Surface.
     """
@@ -139,10 +139,10 @@ class Light:
     """One lamp.
 
     Attributes:
-        kind: 'point' (a sphere of diameter `size_m`), 'area' (a square of side `size_m`) or 'sun' (at infinity).
-        position_cam_m: Where it stands; without effect for a sun.
-        direction_cam: From the lit scene TOWARDS the lamp (as in posecore.raster), any length but 0: a sun stands in
-            that direction, an area lamp faces the opposite way. Without effect for a point.
+        kind: `point` (a sphere of diameter `size_m`), `area` (a square of side `size_m`) or `sun` (at infinity).
+        position_cam_m: Position; without effect for a sun.
+        direction_cam: From the lit scene TOWARDS the lamp (as in posecore.raster), any length but 0: the direction of a
+            sun, the opposite of an area lamp's normal. Without effect for a point.
         rgb: Linear colour, factors of `strength`.
         strength: Radiant power in W for point and area, irradiance in W/m^2 for a sun.
         size_m: Size in m; for a sun the angle it subtends in rad. 0 gives hard shadows.
@@ -174,11 +174,11 @@ class Environment:
     """A panorama (HDRI) that lights the scene from all around.
 
     Attributes:
-        path: Picture file, .hdr or .exr, equirectangular.
+        path: Image file, .hdr or .exr, equirectangular.
         R_cam_env: (3, 3) rotation from the panorama's frame to the camera's: the panorama's x axis points at the middle
-            of the picture, y at the middle of its left half, z up (row 0).
-        strength: Linear radiance that a white surface shows which faces the panorama's average side; the file's own
-            exposure is without effect (see `hdri.load`).
+            of the image, y at the middle of its left half, z up (row 0).
+        strength: Linear radiance of a white surface that faces the panorama's average side; the file's exposure is
+            without effect (see `hdri.load`).
     """
 
     path: str
@@ -188,7 +188,7 @@ class Environment:
     def __post_init__(self) -> None:
         R = np.array(self.R_cam_env, dtype=np.float64)
         if R.shape != (3, 3) or not np.allclose(R @ R.T, np.eye(3), atol=_ROTATION_TOLERANCE) or np.linalg.det(R) < 0:
-            raise ConfigError("environment.R_cam_env: got something else, expected a 3 x 3 rotation matrix")
+            raise ConfigError(f"environment.R_cam_env: got {R.tolist()}, expected a 3 x 3 rotation matrix")
         R.setflags(write=False)
         object.__setattr__(self, "R_cam_env", R)
         _number("environment.strength", self.strength, 0.0)
@@ -196,13 +196,13 @@ class Environment:
 
 @dataclass(frozen=True, kw_only=True)
 class Background:
-    """What lies behind the rendered objects.
+    """Background of the rendered objects.
 
     Attributes:
-        kind: 'procedural' (drawn from `seed`), 'photo' (a crop of the picture at `path`, chosen by `seed`) or
-            'environment' (what the scene's panorama shows in the camera's direction).
-        seed: Seed of the drawing or the crop.
-        path: Picture file; only for 'photo'.
+        kind: `procedural` (drawn from `seed`), `photo` (a crop of the image at `path`, chosen by `seed`) or
+            `environment` (the scene's panorama in the camera's direction).
+        seed: Seed of the procedural image or the crop.
+        path: Image file; only for `photo`.
     """
 
     kind: BackgroundKind = "procedural"
@@ -218,7 +218,7 @@ class Background:
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """What the camera does to the light between the lens and the file.
+    """Camera effects, from the lens to the image file.
 
     Attributes:
         exposure_ev: Exposure in stops; linear light is multiplied by 2**exposure_ev.
@@ -226,8 +226,8 @@ class Sensor:
         noise_sigma: Standard deviation of the noise in display units, [0, 1].
         blur_sigma_px: Gaussian defocus, standard deviation in px.
         motion_px: Length of the straight motion blur in px.
-        motion_angle_rad: Its direction in the image, from x right towards y down.
-        jpeg_quality: 1 to 100; None does not compress.
+        motion_angle_rad: Direction of the motion blur in the image, from x right towards y down.
+        jpeg_quality: 1 to 100; None for no JPEG compression.
         seed: Seed of the noise.
     """
 
@@ -253,21 +253,20 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Everything that decides the pixels of one picture.
+    """Everything that decides the pixels of one image.
 
     Attributes:
         camera: Pinhole camera of the full image.
-        region_px: (x0, y0, width, height): the pixels of the camera's plane to render. The plane goes on beyond the
-            image, so a region may start below 0 or end past the image.
-        objects: What stands before the camera; index 0 is the target object, the rest are occluders and props. The
-            position in this tuple is the value in `RenderedScene.index`.
+        region_px: (x0, y0, width, height) of the image plane to render. It may start below 0 or end past the image.
+        objects: Objects; index 0 is the target object, the rest are occluders and props. The position in this tuple is
+            the value in `RenderedScene.index`.
         lights: Lamps.
-        ambient_rgb: Linear radiance that comes from every direction; it lights objects and is never seen itself.
-        environment: Panorama that adds its light to that of the lamps; None adds nothing.
-        background: What is composed behind the objects.
+        ambient_rgb: Linear radiance from every direction; it lights objects and is itself invisible.
+        environment: Panorama that lights the scene in addition to the lamps, or None.
+        background: Background behind the objects.
         sensor: Camera effects.
         samples: Light paths per pixel.
-        render_seed: Seed of the noise pattern, 0 to 2**31 - 1. Give each scene its own, or all share one pattern.
+        render_seed: Seed of the noise pattern, 0 to 2**31 - 1, different for each scene.
     """
 
     camera: Camera

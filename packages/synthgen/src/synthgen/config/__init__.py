@@ -1,14 +1,14 @@
-"""Sampling configuration: every number that decides what a dataset looks like, with the defaults that are shipped.
+"""Sampling configuration: every parameter of a dataset, with its default.
 
-Ranges are (low, high) pairs drawn uniformly unless said otherwise. Sizes are in units of the object's diameter where
-the field's name ends in `_diameter`, so that one preset serves a 3 cm screw and a 2 m chair.
+A range is a (low, high) pair, drawn uniformly unless its field states another distribution. Sizes are in units of the
+object's diameter where the field's name ends in `_diameter`, so that one preset serves a 3 cm screw and a 2 m chair.
 """
 
 from synthgen.config.cut import CutConfig, load_cut_config
-from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
+from synthgen.config.geometry import CameraConfig, DistanceConfig, FixedWindowConfig, PerturbationConfig, ViewConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.recipe import SynthConfig, load_config, preset_names
-from synthgen.config.renamed_keys import RENAMED_KEYS, migrate, refuse_renamed
+from synthgen.config.renamed_keys import RENAMED_KEYS, migrate
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -25,6 +25,7 @@ __all__ = [
     "CameraConfig",
     "CutConfig",
     "DistanceConfig",
+    "FixedWindowConfig",
     "FrameConfig",
     "LightConfig",
     "MaterialConfig",
@@ -36,10 +37,8 @@ __all__ = [
     "SynthConfig",
     "TabletopConfig",
     "ViewConfig",
-    "WindowConfig",
     "load_config",
     "load_cut_config",
     "migrate",
     "preset_names",
-    "refuse_renamed",
 ]

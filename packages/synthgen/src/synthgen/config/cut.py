@@ -1,65 +1,58 @@
-"""Configuration of pairs that are cut out of annotated images."""
+"""Configuration of training pairs cropped from annotated images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from posecore import config as config_tools
+from posecore.config import Range, check_ranges
+from posecore.renamed import refuse_renamed_keys
 
-from synthgen.config.geometry import PerturbationConfig
-from synthgen.config.ranges import MAX_PATCH_PX, check
-from synthgen.config.renamed_keys import refuse_renamed
+from synthgen.config.geometry import MAX_PATCH_PX, PerturbationConfig
+from synthgen.config.renamed_keys import RENAMED_KEYS
 
 
 @dataclass(frozen=True, kw_only=True)
 class CutConfig:
-    """How pairs are cut out of annotated images; with the images it decides every byte.
+    """Crops of annotated images; with the images, this configuration decides every byte.
 
     Attributes:
-        seed: Of hypotheses.
+        seed: Seed of the hypotheses.
         patch_px: Side of the patches.
         contour_points: Contour points per silhouette.
-        hypotheses_per_pose: Drawn around each annotated pose; without effect on hypotheses from a file.
+        hypotheses_per_pose: Hypotheses drawn around each annotated pose; without effect on hypotheses from a file.
         shard_size: Pairs in a shard.
-        min_visible: Annotated poses that are visible by less are left out, and those whose box the image shows less of.
-        min_area_px: So are pairs of which the convex hull of one silhouette covers fewer pixels of image or patch.
-        images: Most images to cut, evenly spread over those that are there; 0 cuts all.
-        images_per_scene: So many images of a BOP scene, one after the other, count as one scene (training holds out
-            whole ones). 0: all of them where there are several BOP scenes, else each by itself.
-        window: `diameter` follows the hypothesis' distance and shows every pose as large, for networks whose own window
-            does so; `fixed` is the paper's, of one side for all poses of an object.
-        scale: Side of a diameter window over the projected diameter. Larger than the network's own, which is cut out
-            of it around other hypotheses.
-        padding: Added to an object's largest silhouette box at its nearest pose, as a share of it: its fixed window.
-        perturbation: How far drawn hypotheses lie from the truth.
+        min_visible: Smallest visible fraction of an annotated pose, and smallest fraction of its box inside the image;
+            other poses are left out.
+        min_area_px: Smallest area of the convex hull of either silhouette, in image pixels and in patch pixels; other
+            pairs are left out.
+        images: Maximum number of images, evenly spaced over the dataset; 0 takes all.
+        images_per_scene: Consecutive images of a BOP scene that count as one scene (training holds out whole scenes).
+            0 takes the BOP scenes, or single images where there is only one BOP scene.
+        window: `diameter` scales with the hypothesis' distance, so that the object has the same size in every patch, as
+            for networks with such a window; `fixed` is the paper's, with one side for all poses of an object.
+        scale: Side of a diameter window over the projected diameter. Larger than the network's own window, which is
+            cropped from the patch around other hypotheses.
+        padding: Margin of the fixed window, as a fraction of the object's largest silhouette box at its nearest pose.
+        perturbation: Distance of drawn hypotheses from the ground truth.
     """
 
-    seed: int = 0
-    patch_px: int = 224
-    contour_points: int = 100
-    hypotheses_per_pose: int = 8
-    shard_size: int = 64
-    min_visible: float = 0.1
-    min_area_px: float = 150.0
-    images: int = 0
-    images_per_scene: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    patch_px: Annotated[int, Range(16, MAX_PATCH_PX)] = 224
+    contour_points: Annotated[int, Range(1, 100_000)] = 100
+    hypotheses_per_pose: Annotated[int, Range(1, 4096)] = 8
+    shard_size: Annotated[int, Range(1, 1_000_000)] = 64
+    min_visible: Annotated[float, Range(0, 1)] = 0.1
+    min_area_px: Annotated[float, Range(1)] = 150.0
+    images: Annotated[int, Range(0)] = 0
+    images_per_scene: Annotated[int, Range(0)] = 0
     window: Literal["diameter", "fixed"] = "diameter"
-    scale: float = 2.0
-    padding: float = 0.3
+    scale: Annotated[float, Range(1, 8)] = 2.0
+    padding: Annotated[float, Range(0, 4)] = 0.3
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
 
     def __post_init__(self) -> None:
-        check("seed", self.seed, 0, 2**63 - 1)
-        check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
-        check("contour_points", self.contour_points, 1, 100_000)
-        check("hypotheses_per_pose", self.hypotheses_per_pose, 1, 4096)
-        check("shard_size", self.shard_size, 1, 1_000_000)
-        check("min_visible", self.min_visible, 0.0, 1.0)
-        check("min_area_px", self.min_area_px, 1.0)
-        check("images", self.images, 0)
-        check("images_per_scene", self.images_per_scene, 0)
-        check("scale", self.scale, 1.0, 8.0)
-        check("padding", self.padding, 0.0, 4.0)
+        check_ranges(self)
 
 
 def load_cut_config(overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None) -> CutConfig:
@@ -73,6 +66,6 @@ def load_cut_config(overrides: Sequence[str] = (), values: Mapping[str, Any] | N
         ConfigError: Unknown key or value, or a key with a new name; the message names it.
     """
     mapping = config_tools.apply_overrides({}, overrides)
-    refuse_renamed(mapping, "--set")
+    refuse_renamed_keys(mapping, RENAMED_KEYS, "--set")
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
     return config_tools.build(CutConfig, mapping, "settings")

@@ -1,18 +1,26 @@
-"""The whole recipe of a dataset, and how it is put together from presets and overrides."""
+"""The whole configuration of a dataset, resolved from presets and overrides."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from posecore import config as config_tools
+from posecore.config import Range, check_ranges
 from posecore.errors import ConfigError
 from posecore.files import data_spec
+from posecore.renamed import refuse_renamed_keys
 
-from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
+from synthgen.config.geometry import (
+    MAX_PATCH_PX,
+    CameraConfig,
+    DistanceConfig,
+    FixedWindowConfig,
+    PerturbationConfig,
+    ViewConfig,
+)
 from synthgen.config.images import FrameConfig, SequenceConfig
-from synthgen.config.ranges import MAX_PATCH_PX, check
-from synthgen.config.renamed_keys import refuse_renamed
+from synthgen.config.renamed_keys import RENAMED_KEYS
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -27,48 +35,48 @@ from synthgen.names import Device, EngineName
 
 @dataclass(frozen=True, kw_only=True)
 class SynthConfig:
-    """A dataset's whole recipe; with the object and the number of samples it decides every byte.
+    """A dataset's whole configuration; with the objects and the number of samples it decides every byte.
 
     Attributes:
         seed: Dataset seed.
         engine: Renderer of the scenes.
-        hypothesis_engine: Renderer of the hypothesis patches; the rasteriser is what inference uses.
-        device: Where Cycles traces.
+        hypothesis_engine: Renderer of the hypothesis patches; inference uses the rasteriser.
+        device: Device of Cycles.
         samples: Light paths per pixel of the Blender engines.
         patch_px: Side of the patches.
         contour_points: Contour points per silhouette.
-        hypotheses_per_scene: Hypotheses that share one rendered scene.
-        shard_size: Samples in a shard: the unit of work and of resuming. A multiple of `hypotheses_per_scene`.
+        hypotheses_per_scene: Hypotheses per rendered scene.
+        shard_size: Samples in a shard, the unit of work and of resuming. A multiple of `hypotheses_per_scene`.
         camera: Intrinsics.
         distance: Distance of the object.
-        view: Viewpoint and place in the image.
-        perturbation: Distance of the hypotheses from the truth.
+        view: Viewpoint and position in the image.
+        perturbation: Distance of the hypotheses from the ground truth.
         window: Fixed window.
         scene: Kinds of scene.
-        tabletop: Scenes on a table.
-        lights: Lamps.
-        material: The object's surface.
-        occluders: Shapes around it.
-        background: What lies behind.
+        tabletop: Tabletop scenes.
+        lights: Lighting.
+        material: Surface of the object.
+        occluders: Occluders and props.
+        background: Background.
         sensor: Camera effects.
         frames: Whole camera images.
         sequence: Motion of tracking sequences.
     """
 
-    seed: int = 0
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
     engine: EngineName = "cycles"
     hypothesis_engine: EngineName = "raster"
     device: Device = "cpu"
-    samples: int = 16
-    patch_px: int = 224
-    contour_points: int = 100
-    hypotheses_per_scene: int = 8
-    shard_size: int = 64
+    samples: Annotated[int, Range(1, 65536)] = 16
+    patch_px: Annotated[int, Range(16, MAX_PATCH_PX)] = 224
+    contour_points: Annotated[int, Range(1, 100_000)] = 100
+    hypotheses_per_scene: Annotated[int, Range(1, 4096)] = 8
+    shard_size: Annotated[int, Range(1, 1_000_000)] = 64
     camera: CameraConfig = field(default_factory=CameraConfig)
     distance: DistanceConfig = field(default_factory=DistanceConfig)
     view: ViewConfig = field(default_factory=ViewConfig)
     perturbation: PerturbationConfig = field(default_factory=PerturbationConfig)
-    window: WindowConfig = field(default_factory=WindowConfig)
+    window: FixedWindowConfig = field(default_factory=FixedWindowConfig)
     scene: SceneConfig = field(default_factory=SceneConfig)
     tabletop: TabletopConfig = field(default_factory=TabletopConfig)
     lights: LightConfig = field(default_factory=LightConfig)
@@ -80,17 +88,12 @@ class SynthConfig:
     sequence: SequenceConfig = field(default_factory=SequenceConfig)
 
     def __post_init__(self) -> None:
-        check("seed", self.seed, 0, 2**63 - 1)
-        check("samples", self.samples, 1, 65536)
-        check("patch_px", self.patch_px, 16, MAX_PATCH_PX)
-        check("contour_points", self.contour_points, 1, 100_000)
-        check("hypotheses_per_scene", self.hypotheses_per_scene, 1, 4096)
-        check("shard_size", self.shard_size, 1, 1_000_000)
+        check_ranges(self)
         if self.shard_size % self.hypotheses_per_scene:
             near = max(1, round(self.shard_size / self.hypotheses_per_scene)) * self.hypotheses_per_scene
             raise ConfigError(
                 f"shard_size is {self.shard_size}, expected a multiple of hypotheses_per_scene "
-                f"({self.hypotheses_per_scene}) because a scene lives in one shard; try shard_size={near}"
+                f"({self.hypotheses_per_scene}) because a scene is in one shard; try shard_size={near}"
             )
 
 
@@ -120,8 +123,7 @@ def load_config(
         raise ConfigError(
             f"--preset {preset}: there is no such preset; choose one of {', '.join(preset_names())} or a .yaml file"
         )
-    refuse_renamed(mapping, where)
-    refuse_renamed(config_tools.apply_overrides({}, overrides), "--set")
+    refuse_renamed_keys(config_tools.apply_overrides({}, overrides), RENAMED_KEYS, "--set")
     mapping = config_tools.apply_overrides(mapping, overrides)
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
-    return config_tools.build(SynthConfig, mapping, where)
+    return config_tools.build(SynthConfig, mapping, where, RENAMED_KEYS)

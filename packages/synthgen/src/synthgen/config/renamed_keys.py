@@ -1,9 +1,9 @@
-"""Configuration keys that have a new name: refused in what a user writes, migrated in what earlier versions stored."""
+"""Renamed configuration keys: refused in a user's configuration, migrated in a stored one."""
 
 from collections.abc import Mapping
 from typing import Any
 
-from posecore.errors import ConfigError
+from posecore.renamed import migrated_keys
 
 RENAMED_KEYS: dict[str, str] = {
     "perturbation.easy_share": "perturbation.easy_fraction",
@@ -22,30 +22,9 @@ RENAMED_KEYS: dict[str, str] = {
     "sequence.pass_every_s": "sequence.occluder_period_s",
     "sequence.light_swing": "sequence.light_variation",
 }
-"""New key by old key, of `SynthConfig` and `CutConfig`, group and name with a dot between."""
-
-
-def refuse_renamed(mapping: Mapping[str, Any], where: str) -> None:
-    """Check a user's configuration for old keys.
-
-    Args:
-        mapping: Groups of keys.
-        where: File or option, for the message.
-
-    Raises:
-        ConfigError: A key has a new name; the message has both.
-    """
-    for group, values in mapping.items():
-        for key in values if isinstance(values, Mapping) else ():
-            if (old := f"{group}.{key}") in RENAMED_KEYS:
-                raise ConfigError(f"{where}: the key {old} was renamed; write {RENAMED_KEYS[old]}")
+"""New key of `SynthConfig` and `CutConfig` by old key, see `posecore.renamed`."""
 
 
 def migrate(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a stored configuration, e.g. of a data card, with today's keys in the stored order."""
-    return {
-        group: {RENAMED_KEYS.get(f"{group}.{key}", f".{key}").partition(".")[2]: value for key, value in values.items()}
-        if isinstance(values, Mapping)
-        else values
-        for group, values in mapping.items()
-    }
+    """A copy of a stored configuration, e.g. of a data card, with the new keys."""
+    return migrated_keys(mapping, RENAMED_KEYS)

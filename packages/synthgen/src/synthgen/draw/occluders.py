@@ -1,4 +1,4 @@
-"""Shapes that stand in front of, beside and behind the object: primitives, or meshes of the user's."""
+"""Shapes in front of, beside and behind the object: primitives, or the user's meshes."""
 
 import colorsys
 import math
@@ -17,29 +17,31 @@ from synthgen.scene import Material, SceneObject
 
 Array = np.ndarray
 
-_SHARP_EDGE_RAD = 0.6  # faces that meet at more than this are shaded flat
-_LARGEST_SHARE_OF_DISTANCE = 0.6  # a larger shape has no place between camera and object
-_EXTRA_FRONT = 4  # shapes that may be added to reach a wanted visible share
+_SHARP_EDGE_RAD = 0.6  # dihedral angle from which an edge is shaded flat
+_MAX_DISTANCE_FRACTION = 0.6  # a larger shape does not fit between camera and object
+_EXTRA_FRONT = 4  # maximum number of shapes added to reach a visible fraction
 _BISECTIONS = 6
-_NEAR_ENOUGH = 0.02  # of the wanted visible share
+_TOLERANCE = 0.02  # of the visible fraction
 
 
-def fitted(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float, meshes: Sequence[Mesh]) -> list[Mesh]:
-    """Occluder meshes scaled to `config.size_diameter` times the object's diameter, each once, about their centres."""
+def scaled_meshes(
+    config: OccluderConfig, seed: int, obj_id: int, diameter_m: float, meshes: Sequence[Mesh]
+) -> list[Mesh]:
+    """Occluder meshes scaled to `config.size_diameter` times the object's diameter, each once, centred."""
     rng = stream(seed, Purpose.PAIRS, Subject.LIBRARY, obj_id)
-    chosen = sorted(rng.permutation(len(meshes))[: config.library].tolist())
+    indices = sorted(rng.permutation(len(meshes))[: config.library].tolist())
     shapes = []
-    for i in chosen:
+    for i in indices:
         size_m = diameter_m * rng.uniform(*config.size_diameter)
         vertices = (meshes[i].vertices_m - meshes[i].center_m) * (size_m / meshes[i].diameter_m)
         shapes.append(replace(meshes[i], vertices_m=vertices))
     return shapes
 
 
-def library(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float) -> list[Mesh]:
-    """The shapes of a dataset for an object of this size: boxes, cylinders, spheres, cones, tori, capsules.
+def primitive_shapes(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float) -> list[Mesh]:
+    """Primitives of a dataset for an object of this size: boxes, cylinders, spheres, cones, tori, capsules.
 
-    Every shape has colours of its own; the sizes are `config.size_diameter` times the object's diameter.
+    Every shape has different colours; the sizes are `config.size_diameter` times the object's diameter.
     """
     shapes = []
     for i in range(config.library):
@@ -49,23 +51,23 @@ def library(config: OccluderConfig, seed: int, obj_id: int, diameter_m: float) -
     return shapes
 
 
-def place(
+def draw_occluders(
     rng: np.random.Generator,
     config: OccluderConfig,
     shapes: Mapping[int, Mesh],
     centre_cam_m: Float[Array, "3"],
     diameter_m: float,
 ) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
-    """Place shapes in front of and around an object whose box centre is at `centre_cam_m`.
+    """Draw shapes in front of and around an object whose box centre is at `centre_cam_m`.
 
-    Those in front reach over the object's edge more or less; whether too much of it is hidden only a render can tell
-    (see `pair.PairMaker`). Those around it keep clear of its bounding sphere. A shape that is too large to stand
-    between camera and object is not used.
+    Occluders in front reach over the object's edge; a render decides whether the object is too occluded (see
+    `pair_maker.PairMaker`). Props around it keep clear of its bounding sphere. A shape that does not fit between camera
+    and object is not used.
 
     Returns:
-        Those in front and those around.
+        Occluders in front, and props around.
     """
-    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _LARGEST_SHARE_OF_DISTANCE * centre_cam_m[2]]
+    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _MAX_DISTANCE_FRACTION * centre_cam_m[2]]
     front, props = [], []
     for _ in range(rng.integers(config.front[0], config.front[1] + 1) if keys else 0):
         key = keys[int(rng.integers(len(keys)))]
@@ -76,7 +78,7 @@ def place(
     return tuple(front), tuple(props)
 
 
-def slide_in(
+def move_in_front(
     rng: np.random.Generator,
     config: OccluderConfig,
     shapes: Mapping[int, Mesh],
@@ -86,30 +88,30 @@ def slide_in(
     visible_of: Callable[[tuple[SceneObject, ...]], float],
     lift: Callable[[SceneObject], SceneObject],
 ) -> tuple[SceneObject, ...]:
-    """Slide shapes in front of an object until as much of it is visible as `config.visible_fraction` draws.
+    """Move occluders in front of an object until its visible fraction is the one drawn from `config.visible_fraction`.
 
-    One shape after another comes in from outside towards a place over the object. The first one that would hide too
-    much is stopped on its way, by bisection. Where all of them hide too little, up to four more are added.
+    One occluder after another moves in from outside towards a position over the object. The first one that hides too
+    much is stopped on its path, by bisection. Where all occluders together hide too little, up to four are added.
 
     Args:
-        rng: Stream of the wanted share, of the places and of the added shapes.
-        config: Its `visible_fraction` must be set.
+        rng: Stream of the visible fraction, the positions and the added shapes.
+        config: `visible_fraction` must be set.
         shapes: Occluder meshes by key.
         centre_cam_m: The object's box centre.
         diameter_m: The object's diameter.
-        front: Shapes in front, as `place` made them.
-        visible_of: The object's visible share with these shapes in front, as a small render sees it.
-        lift: Moves a shape out of the table.
+        front: Occluders in front, from `draw_occluders`.
+        visible_of: Visible fraction of the object behind these occluders, from a low-resolution render.
+        lift: Moves an occluder out of the table.
 
     Returns:
-        The shapes in front, none that does not reach the object.
+        Occluders in front; those that do not reach the object are left out.
     """
     assert config.visible_fraction is not None
-    wanted = rng.uniform(*config.visible_fraction)
+    goal = rng.uniform(*config.visible_fraction)
     waiting = list(front)
-    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _LARGEST_SHARE_OF_DISTANCE * centre_cam_m[2]]
+    keys = [k for k in sorted(shapes) if shapes[k].diameter_m <= _MAX_DISTANCE_FRACTION * centre_cam_m[2]]
     placed: tuple[SceneObject, ...] = ()
-    if config.front[1] == 0 or not keys or visible_of(placed) <= wanted + _NEAR_ENOUGH:
+    if config.front[1] == 0 or not keys or visible_of(placed) <= goal + _TOLERANCE:
         return placed
     for _ in range(len(waiting) + _EXTRA_FRONT):
         if waiting:
@@ -117,27 +119,27 @@ def slide_in(
         else:
             key = keys[int(rng.integers(len(keys)))]
             item = _object(rng, shapes, key, _in_front(rng, centre_cam_m, diameter_m, shapes[key].diameter_m))
-        way = _way_in(rng, item, shapes[item.mesh_key], centre_cam_m, diameter_m, lift)
-        inside = (*placed, way(1.0))
+        path = _path(rng, item, shapes[item.mesh_key], centre_cam_m, diameter_m, lift)
+        inside = (*placed, path(1.0))
         visible = visible_of(inside)
-        if visible > wanted + _NEAR_ENOUGH:
+        if visible > goal + _TOLERANCE:
             placed = inside
             continue
-        if visible >= wanted - _NEAR_ENOUGH:
+        if visible >= goal - _TOLERANCE:
             return inside
         low, high = 0.0, 1.0  # hides too little, hides too much
         for _ in range(_BISECTIONS):
             middle = (low + high) / 2
-            visible = visible_of((*placed, way(middle)))
-            if abs(visible - wanted) <= _NEAR_ENOUGH:
+            visible = visible_of((*placed, path(middle)))
+            if abs(visible - goal) <= _TOLERANCE:
                 low = middle
                 break
-            low, high = (middle, high) if visible > wanted else (low, middle)
-        return (*placed, way(low))
+            low, high = (middle, high) if visible > goal else (low, middle)
+        return (*placed, path(low))
     return placed
 
 
-def _way_in(
+def _path(
     rng: np.random.Generator,
     item: SceneObject,
     shape: Mesh,
@@ -145,21 +147,21 @@ def _way_in(
     diameter_m: float,
     lift: Callable[[SceneObject], SceneObject],
 ) -> Callable[[float], SceneObject]:
-    """A shape's way at its own depth from where it hides nothing (0) to a place over the object (1)."""
-    at = item.T_cam_obj[:3, :3] @ shape.center_m + item.T_cam_obj[:3, 3]
-    scale = at[2] / centre_cam_m[2]
+    """Path of an occluder at constant depth, from a position where it hides nothing (0) to one over the object (1)."""
+    centre = shape.center_cam_m(item.T_cam_obj)
+    scale = centre[2] / centre_cam_m[2]
     angle = rng.uniform(0, 2 * math.pi)
     over = centre_cam_m * scale + _sideways(rng) * rng.uniform(0.0, 0.35) * diameter_m * scale
     out = centre_cam_m * scale + np.array([math.cos(angle), math.sin(angle), 0.0]) * 0.75 * (
         diameter_m * scale + shape.diameter_m
     )
 
-    def place_at(share: float) -> SceneObject:
+    def occluder_at(fraction: float) -> SceneObject:
         T = item.T_cam_obj.copy()
-        T[:3, 3] += out + (over - out) * share - at
+        T[:3, 3] += out + (over - out) * fraction - centre
         return lift(replace(item, T_cam_obj=T))
 
-    return place_at
+    return occluder_at
 
 
 def _in_front(
@@ -194,16 +196,16 @@ def _object(
 ) -> SceneObject:
     R = random_rotation(rng)
     t = position_cam_m - R @ shapes[key].center_m
-    return SceneObject(mesh_key=key, T_cam_obj=make_T(R, t), material=look(rng))
+    return SceneObject(mesh_key=key, T_cam_obj=make_T(R, t), material=draw_occluder_material(rng))
 
 
-def look(rng: np.random.Generator) -> Material:
-    """A shape's surface: its own colours turned to another hue, or one colour all over."""
-    own_colours = rng.random() < 0.4
-    base = None if own_colours else colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 1.0), rng.uniform(0.05, 1.0))
+def draw_occluder_material(rng: np.random.Generator) -> Material:
+    """Material of an occluder: the mesh's colours rotated in hue, or one colour all over."""
+    keeps_colours = rng.random() < 0.4
+    base = None if keeps_colours else colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.0, 1.0), rng.uniform(0.05, 1.0))
     return Material(
         base_rgb=base,
-        hue_shift=float(rng.uniform(-0.5, 0.5)) if own_colours else 0.0,
+        hue_shift=float(rng.uniform(-0.5, 0.5)) if keeps_colours else 0.0,
         roughness=float(rng.uniform(0.1, 1.0)),
         metallic=float(rng.random() < 0.15),
         specular=float(rng.uniform(0.1, 0.9)),
@@ -243,7 +245,7 @@ def _shape(rng: np.random.Generator, index: int, size_m: float) -> Mesh:
 
 
 def _colours(rng: np.random.Generator, vertices: Float[Array, "v 3"]) -> Array:
-    """Two or three colours by bands across the shape: soft where vertices are few, sharp where they are many."""
+    """Two or three colours in bands across the shape; edges are as sharp as the vertices are dense."""
     palette = rng.integers(0, 256, (int(rng.integers(2, 4)), 3))
     axis = rng.normal(size=3)
     t = vertices @ (axis / np.linalg.norm(axis))

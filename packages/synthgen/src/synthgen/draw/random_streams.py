@@ -1,7 +1,7 @@
-"""Random streams: every draw of a dataset has an address, so sample i never depends on sample i - 1.
+"""Random streams by address, so that sample i never depends on sample i - 1.
 
-A stream is addressed by (seed, purpose, subject, scene, attempt, ...). Different subjects (pose, lights, ...) have
-streams of their own: changing the lamps in a configuration leaves the poses of every sample as they were.
+A stream has the address (seed, purpose, subject, scene, attempt, ...). Each subject (pose, lights, ...) has its own
+stream: changing the lamps in a configuration keeps the poses of every sample.
 """
 
 from enum import IntEnum
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What the scenes are for: training pairs, images of different splits, sequences and given images share none."""
+    """Purpose of a scene: pairs, images of each split, sequences of each split, annotated images; none share draws."""
 
     PAIRS = 0
     FRAMES = 1
@@ -23,7 +23,7 @@ class Purpose(IntEnum):
 
 
 class Subject(IntEnum):
-    """What is drawn."""
+    """Subject of a draw."""
 
     POSE = 0
     LIGHTS = 1
@@ -42,7 +42,7 @@ class Subject(IntEnum):
     VISIBILITY = 14
     TABLETOPS = 15
     VIEW = 16
-    SETTING = 17
+    PLACEMENT = 17
     COMPANIONS = 18
     CAMERA = 19
     MOTION = 20
@@ -54,5 +54,5 @@ def stream(seed: int, purpose: Purpose, subject: Subject, *address: int) -> np.r
 
 
 def child_seed(rng: np.random.Generator) -> int:
-    """A seed for something drawn later, in [0, 2**31)."""
+    """A seed for a later draw, in [0, 2**31)."""
     return int(rng.integers(0, 2**31))

@@ -1,4 +1,4 @@
-"""Why draws are rejected, and which setting is to blame when all of them are."""
+"""Reasons for the rejection of draws, and the error when all draws of a scene are rejected."""
 
 from collections import Counter
 from typing import Literal
@@ -7,32 +7,32 @@ from posecore.errors import ConfigError
 
 from synthgen.config import SynthConfig
 
-# Of scenes: the object is outside the image, too small, hidden, or has no hypothesis. Of hypotheses: a silhouette
-# leaves the window, or is too small.
+# Scenes are rejected because the object is outside the image, too small, hidden, or has no hypothesis; hypotheses
+# because a silhouette leaves the window or is too small.
 Reason = Literal["outside", "small", "hidden", "no hypothesis", "left window", "too small"]
 Tally = Counter[Reason]
 
-_OF_SCENES: tuple[Reason, ...] = ("outside", "small", "hidden", "no hypothesis")
+_SCENE_REASONS: tuple[Reason, ...] = ("outside", "small", "hidden", "no hypothesis")
 
 
 def nothing_accepted(scene_index: int, name: str, tally: Tally, config: SynthConfig) -> ConfigError:
-    """The error for a scene none of whose draws can be used; it names the setting that rejected most of them.
+    """The error for a scene without an acceptable draw; it names the setting that rejected most draws.
 
     Args:
-        scene_index: Which scene.
+        scene_index: Index of the scene.
         name: The object's name.
         tally: Rejections by reason.
-        config: Recipe.
+        config: Configuration.
     """
-    scenes = {reason: tally[reason] for reason in _OF_SCENES if tally[reason]}
+    scenes = {reason: tally[reason] for reason in _SCENE_REASONS if tally[reason]}
     worst: Reason = max(scenes, key=lambda reason: scenes[reason], default="hidden")
-    said = {
+    descriptions = {
         "outside": "the object outside the image",
         "small": "its silhouette too small",
-        "hidden": "too much of it hidden",
-        "no hypothesis": "no hypothesis that fits",
+        "hidden": "the object too occluded",
+        "no hypothesis": "no acceptable hypothesis",
     }
-    counted = ", ".join(f"{count} x {said[reason]}" for reason, count in scenes.items())
+    counted = ", ".join(f"{count} x {descriptions[reason]}" for reason, count in scenes.items())
     advice = _advice(worst, tally, config)
     return ConfigError(f"scene {scene_index} ({name}): all {sum(scenes.values())} draws rejected ({counted}); {advice}")
 

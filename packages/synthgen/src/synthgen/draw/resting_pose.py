@@ -1,4 +1,4 @@
-"""How a mesh comes to rest on a plane."""
+"""Stable poses of a mesh on a plane."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,19 +11,19 @@ from scipy.spatial import ConvexHull, QhullError
 
 Array = np.ndarray
 
-_DROPS = 2048  # directions that a mesh is dropped in, spread evenly
-_MOST_HULL_POINTS = 600  # a hull with more vertices is taken at those that are extreme in one of as many directions
-_SAME = 1e-6  # planes and heights nearer than this share of the diameter are one
+_DROPS = 2048  # evenly spaced directions in which a mesh is dropped
+_MAX_HULL_POINTS = 600  # a hull with more vertices is reduced to those extreme in one of as many directions
+_TOLERANCE = 1e-6  # fraction of the diameter within which planes and heights are equal
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Rest:
+class StablePoses:
     """Stable poses of one mesh.
 
     Attributes:
         hull_m: (h, 3) vertices of the convex hull, object coordinates.
-        down: (k, 3) unit directions, object coordinates: pointing down, the mesh rests.
-        weights: (k,) chance of each when the mesh is dropped in a random orientation; they sum to 1.
+        down: (k, 3) unit directions, object coordinates, that point down when the mesh is at rest.
+        weights: (k,) probability of each after a drop in a random orientation; they sum to 1.
     """
 
     hull_m: Float[Array, "h 3"]
@@ -31,12 +31,12 @@ class Rest:
     weights: Float[Array, " k"]
 
 
-def find_rest(mesh: Mesh) -> Rest:
-    """Find the facets of the convex hull that a mesh comes to rest on, and how often.
+def find_stable_poses(mesh: Mesh) -> StablePoses:
+    """Facets of the convex hull that a mesh comes to rest on, with their probabilities.
 
-    Quasi-static: from the facet hit by a ray down from the centre of mass the mesh rolls over the edge that its centre
-    of mass hangs over, facet by facet, until it hangs over none. The rolling goes downhill, so it ends. No random
-    number is drawn. The centre of mass is that of the mesh where it encloses a volume, of its hull where it does not.
+    Quasi-static: from the facet hit by a downward ray from the centre of mass, the mesh rolls over the edge beyond
+    which its centre of mass lies, facet by facet, until there is no such edge. The rolling goes downhill, so it ends.
+    No random number is drawn. The centre of mass is that of the mesh if it encloses a volume, else of its hull.
 
     A mesh without volume rests on either of its two sides.
 
@@ -45,15 +45,15 @@ def find_rest(mesh: Mesh) -> Rest:
     scale = max(mesh.diameter_m, 1e-12)
     try:
         points = mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices]
-        hull = ConvexHull(_extreme(points) if len(points) > _MOST_HULL_POINTS else points)
+        hull = ConvexHull(_extreme(points) if len(points) > _MAX_HULL_POINTS else points)
     except QhullError:
         _, _, axes = np.linalg.svd(mesh.vertices_m - mesh.vertices_m.mean(axis=0), full_matrices=False)
-        return Rest(hull_m=mesh.vertices_m, down=np.stack([axes[2], -axes[2]]), weights=np.array([0.5, 0.5]))
-    planes = np.unique((hull.equations / [1, 1, 1, scale] / _SAME).round() * _SAME, axis=0) * [1, 1, 1, scale]
+        return StablePoses(hull_m=mesh.vertices_m, down=np.stack([axes[2], -axes[2]]), weights=np.array([0.5, 0.5]))
+    planes = np.unique((hull.equations / [1, 1, 1, scale] / _TOLERANCE).round() * _TOLERANCE, axis=0) * [1, 1, 1, scale]
     normals = planes[:, :3] / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
     height = np.maximum(-planes[:, 3] - normals @ _centre_of_mass(mesh, hull), 1e-9 * scale)
     follower = _hit(normals, height, normals)
-    downhill = height[follower] < height * (1.0 - _SAME)
+    downhill = height[follower] < height * (1.0 - _TOLERANCE)
     follower = np.where(downhill, follower, np.arange(len(height)))
     landed = _hit(normals, height, even_directions(_DROPS))
     for _ in range(len(height)):
@@ -62,11 +62,11 @@ def find_rest(mesh: Mesh) -> Rest:
             break
         landed = onward
     facets, counts = np.unique(landed, return_counts=True)
-    return Rest(hull_m=points, down=normals[facets], weights=counts / counts.sum())
+    return StablePoses(hull_m=points, down=normals[facets], weights=counts / counts.sum())
 
 
-class Rests(dict[int, Rest]):
-    """Stable poses by mesh key, found at their first use.
+class StablePosesByKey(dict[int, StablePoses]):
+    """Stable poses by mesh key, computed at their first use.
 
     Args:
         meshes: Meshes by key.
@@ -76,20 +76,20 @@ class Rests(dict[int, Rest]):
         super().__init__()
         self._meshes = meshes
 
-    def __missing__(self, key: int) -> Rest:
-        self[key] = find_rest(self._meshes[key])
+    def __missing__(self, key: int) -> StablePoses:
+        self[key] = find_stable_poses(self._meshes[key])
         return self[key]
 
 
 def _hit(normals: Float[Array, "f 3"], height: Float[Array, " f"], rays: Float[Array, "r 3"]) -> Array:
-    """Facet that each ray from the centre of mass leaves the hull through."""
+    """Facet through which each ray from the centre of mass leaves the hull."""
     slope = rays @ normals.T
     with np.errstate(divide="ignore"):
         return np.asarray(np.where(slope > 1e-9, height / np.maximum(slope, 1e-9), np.inf).argmin(axis=1))
 
 
 def _extreme(points: Float[Array, "p 3"]) -> Float[Array, "q 3"]:
-    return np.asarray(points[np.unique((points @ even_directions(_MOST_HULL_POINTS).T).argmax(axis=0))])
+    return np.asarray(points[np.unique((points @ even_directions(_MAX_HULL_POINTS).T).argmax(axis=0))])
 
 
 def _centre_of_mass(mesh: Mesh, hull: ConvexHull) -> Float[Array, "3"]:

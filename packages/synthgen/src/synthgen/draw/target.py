@@ -1,4 +1,4 @@
-"""Objects that a dataset is about, with what follows from their size."""
+"""Target objects of a dataset: mesh, hull, distance range, window, occluders and tables."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,32 +13,32 @@ from scipy.spatial import ConvexHull, QhullError
 
 from synthgen.config import SynthConfig
 from synthgen.draw import occluders, tabletop
-from synthgen.draw.resting_pose import Rests
+from synthgen.draw.resting_pose import StablePosesByKey
 from synthgen.inputs.assets import Assets
 
 Array = np.ndarray
 
-# A mesh key is an object id below this and a library shape from here on.
+# Mesh keys below this are object ids, from here on keys of library shapes.
 LIBRARY_KEY = 1_000_000
-# Occluder meshes in their own size are the same for all objects: their keys lie below this, and tables' far below.
+# Occluder meshes of unscaled size are common to all objects: their keys are below this, those of tables far below.
 OCCLUDER_KEY = -1000
-_CUTOUT_REACH_DIAMETER = 4.0  # how far behind the object its props reach in a cutout scene
+_CUTOUT_REACH_DIAMETER = 4.0  # largest distance of props behind the object in a cutout scene
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Target:
-    """One object of a dataset.
+class TargetObject:
+    """One target object of a dataset.
 
     Attributes:
         obj_id: BOP object id.
-        name: File name it came from.
+        name: Name of the mesh file.
         mesh: The object.
-        hull_m: (h, 3) vertices of its convex hull: their projections have the same box as the silhouette.
+        hull_m: (h, 3) vertices of the convex hull: their projections have the same box as the silhouette.
         distance_m: Nearest and farthest camera z of the box centre.
-        window_side_px: Side of its fixed window in full-image pixels.
+        window_side_px: Side of the fixed window in full-image pixels.
         shapes: Occluder meshes by mesh key.
-        tables: Table meshes by mesh key; none where no scene has a table.
-        reach_m: How far behind the object's centre a scene may reach.
+        tables: Table meshes by mesh key; empty where no scene has a table.
+        reach_m: Largest extent of a scene behind the object's centre.
     """
 
     obj_id: int
@@ -52,9 +52,9 @@ class Target:
     reach_m: float
 
     @cached_property
-    def rests(self) -> Rests:
+    def stable_poses(self) -> StablePosesByKey:
         """Stable poses of the object and its occluder shapes by mesh key."""
-        return Rests({self.obj_id: self.mesh, **self.shapes})
+        return StablePosesByKey({self.obj_id: self.mesh, **self.shapes})
 
     @cached_property
     def mean_rgb(self) -> Float[Array, "3"]:
@@ -65,8 +65,8 @@ class Target:
         return np.asarray((colours * area[:, None]).sum(axis=0) / max(float(area.sum()), 1e-12))
 
 
-def make_targets(meshes: Mapping[int, Mesh], config: SynthConfig, assets: Assets | None = None) -> list[Target]:
-    """Prepare objects, sorted by id; `window.shared` gives all of them the largest one's window.
+def make_targets(meshes: Mapping[int, Mesh], config: SynthConfig, assets: Assets | None = None) -> list[TargetObject]:
+    """Target objects, sorted by id; with `window.shared` all have the largest window.
 
     Raises:
         ConfigError: The distance range does not suit an object's size.
@@ -78,8 +78,8 @@ def make_targets(meshes: Mapping[int, Mesh], config: SynthConfig, assets: Assets
     return targets
 
 
-def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | None = None) -> Target:
-    """Prepare one object: its hull, distances, window, occluder shapes and tables.
+def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | None = None) -> TargetObject:
+    """A target object with its hull, distances, window, occluder shapes and tables.
 
     Raises:
         ConfigError: The distance range does not suit the object's size.
@@ -96,7 +96,7 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
     if config.scene.kind != "cutout":
         tables = tabletop.tables(config.tabletop, config.seed, mesh.diameter_m, assets.photos)
         reach_m = max(reach_m, tabletop.reach_diameter(config.tabletop) * mesh.diameter_m)
-    return Target(
+    return TargetObject(
         obj_id=obj_id,
         name=Path(mesh.path).name,
         mesh=mesh,
@@ -110,7 +110,7 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
 
 
 def hull(mesh: Mesh) -> Float[Array, "h 3"]:
-    """Vertices of the convex hull; all of them of a flat object, which has no hull with volume."""
+    """Vertices of the convex hull; all vertices of a flat object, whose hull has no volume."""
     try:
         return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices])
     except QhullError:
@@ -120,8 +120,11 @@ def hull(mesh: Mesh) -> Float[Array, "h 3"]:
 def _shapes(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets) -> dict[int, Mesh]:
     if assets.occluders and config.occluders.scale == "own":
         return {OCCLUDER_KEY - i: shape for i, shape in enumerate(assets.occluders[: config.occluders.library])}
-    recipe = (config.occluders, config.seed, obj_id, mesh.diameter_m)
-    shapes = occluders.fitted(*recipe, assets.occluders) if assets.occluders else occluders.library(*recipe)
+    settings = (config.occluders, config.seed, obj_id, mesh.diameter_m)
+    if assets.occluders:
+        shapes = occluders.scaled_meshes(*settings, assets.occluders)
+    else:
+        shapes = occluders.primitive_shapes(*settings)
     first_key = LIBRARY_KEY + obj_id * config.occluders.library
     return {first_key + i: shape for i, shape in enumerate(shapes)}
 

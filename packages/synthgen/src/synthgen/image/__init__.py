@@ -1,1 +1,1 @@
-"""What happens to pixels around a render: backgrounds, panoramas, composition, the camera's sensor."""
+"""Image formation around a render: backgrounds, panoramas, composition, the camera's sensor."""

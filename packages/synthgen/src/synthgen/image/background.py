@@ -1,4 +1,4 @@
-"""Backgrounds: drawn ones of many kinds, random crops of photographs, and what a panorama shows."""
+"""Backgrounds: procedural images of many kinds, random crops of photographs, views of panoramas."""
 
 from collections.abc import Callable
 from functools import lru_cache
@@ -16,15 +16,15 @@ Array = np.ndarray
 Canvas = Float[Array, "h w 3"]
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-PHOTO_SIDE_PX = 1280  # photographs are kept at most this large: a crop never needs more and many fit in memory
+PHOTO_SIDE_PX = 1280  # photographs are reduced to this side: enough for a crop, and many fit in memory
 PHOTOS_IN_MEMORY = 48
 
 
-def behind(scene: Scene, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
-    """What lies behind the rendered objects of a scene, in display colours.
+def render_background(scene: Scene, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+    """The background of a scene in display colours.
 
     Args:
-        scene: Its region has the given size.
+        scene: Scene; `region_px` has the same size.
         width_px: Width.
         height_px: Height.
 
@@ -52,23 +52,23 @@ def draw(background: Background, width_px: int, height_px: int) -> UInt8[Array, 
 
 
 def list_photos(folder: str | Path) -> tuple[str, ...]:
-    """Photographs of a folder, sorted by name, subfolders included; each one's first bytes are looked at.
+    """Photographs of a folder, sorted by name, subfolders included; the header of each file is checked.
 
     Raises:
-        ConfigError: The folder is missing or holds no readable picture, or one of them is broken; the message names it.
+        ConfigError: The folder is missing, holds no readable image, or holds a broken one; the message names it.
     """
     root = Path(folder)
     if not root.is_dir():
         raise ConfigError(f"--backgrounds {folder}: no such folder; give a folder with photographs")
     photos = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES))
     if not photos:
-        raise ConfigError(f"--backgrounds {folder}: no picture in it, expected {', '.join(PHOTO_SUFFIXES)} files")
+        raise ConfigError(f"--backgrounds {folder}: no image in it, expected {', '.join(PHOTO_SUFFIXES)} files")
     broken = [photo for photo in photos if not cv2.haveImageReader(photo)]
     if len(broken) == len(photos):
-        raise ConfigError(f"--backgrounds {folder}: none of its {len(photos)} pictures is readable, e.g. {broken[0]}")
+        raise ConfigError(f"--backgrounds {folder}: none of its {len(photos)} images is readable, e.g. {broken[0]}")
     if broken:
         others = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
-        raise ConfigError(f"{broken[0]}{others}: not a picture; repair it or take it out of --backgrounds {folder}")
+        raise ConfigError(f"{broken[0]}{others}: not an image; repair it or remove it from --backgrounds {folder}")
     return photos
 
 
@@ -76,7 +76,7 @@ def list_photos(folder: str | Path) -> tuple[str, ...]:
 def _photo(path: str) -> UInt8[Array, "h w 3"]:
     image = cv2.imread(path, cv2.IMREAD_COLOR)
     if image is None:
-        raise ConfigError(f"{path}: cannot be read as a picture; remove it from the backgrounds folder")
+        raise ConfigError(f"{path}: cannot be read as an image; remove it from the backgrounds folder")
     scale = PHOTO_SIDE_PX / max(image.shape[:2])
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
@@ -86,7 +86,7 @@ def _photo(path: str) -> UInt8[Array, "h w 3"]:
 def _crop(
     photo: UInt8[Array, "a b 3"], rng: np.random.Generator, width_px: int, height_px: int
 ) -> UInt8[Array, "h w 3"]:
-    """A random rectangle of the wanted shape, between a quarter of the photograph's extent and all of it."""
+    """A random crop with the given aspect ratio, from a quarter of the largest possible size to all."""
     height, width = photo.shape[:2]
     largest = min(width / width_px, height / height_px)
     scale = largest * rng.uniform(0.25, 1.0)
@@ -94,13 +94,13 @@ def _crop(
     x, y = int(rng.integers(0, width - w + 1)), int(rng.integers(0, height - h + 1))
     crop = photo[y : y + h, x : x + w]
     crop = crop[:, ::-1] if rng.random() < 0.5 else crop
-    how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(np.ascontiguousarray(crop), (width_px, height_px), interpolation=how))
+    interpolation = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(np.ascontiguousarray(crop), (width_px, height_px), interpolation=interpolation))
 
 
 def _procedural(rng: np.random.Generator, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
     canvas = _LAYERS[int(rng.integers(len(_LAYERS)))](rng, width_px, height_px)
-    if rng.random() < 0.35:  # two kinds shining through each other
+    if rng.random() < 0.35:  # a blend of two kinds
         other = _LAYERS[int(rng.integers(len(_LAYERS)))](rng, width_px, height_px)
         weight = _noise(rng, width_px, height_px, channels=1, octaves=3)
         canvas = canvas * weight + other * (1 - weight)
@@ -117,7 +117,7 @@ def _procedural(rng: np.random.Generator, width_px: int, height_px: int) -> UInt
 
 
 def _colour(rng: np.random.Generator) -> Float[Array, "3"]:
-    """A colour; half of them nearly grey, as most of the world is."""
+    """A random colour, nearly grey with probability one half, as in photographs."""
     grey = rng.random()
     saturation = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else rng.uniform(0.25, 1.0)
     return np.asarray(grey + (rng.random(3) - grey) * saturation, np.float32)
@@ -134,7 +134,7 @@ def _gradient(rng: np.random.Generator, width_px: int, height_px: int) -> Canvas
 def _noise(
     rng: np.random.Generator, width_px: int, height_px: int, *, channels: int = 3, octaves: int = 6
 ) -> Float[Array, "h w c"]:
-    """Smooth noise at several octaves, stretched to [0, 1]."""
+    """Smooth noise of several octaves, normalised to [0, 1]."""
     total = np.zeros((height_px, width_px, channels), np.float32)
     roughness = rng.uniform(0.4, 0.9)
     for octave in range(octaves):
@@ -149,7 +149,7 @@ def _noise(
 
 
 def _coloured_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Canvas:
-    """Noise between two colours, or free in every channel."""
+    """Noise between two colours, or independent noise in every channel."""
     if rng.random() < 0.4:
         return _noise(rng, width_px, height_px)
     t = _noise(rng, width_px, height_px, channels=1)
@@ -159,7 +159,7 @@ def _coloured_noise(rng: np.random.Generator, width_px: int, height_px: int) -> 
 
 
 def _pattern(rng: np.random.Generator, width_px: int, height_px: int) -> Canvas:
-    """Stripes or checkers, turned, of any spacing."""
+    """Stripes or checkers of random orientation and spacing."""
     angle = rng.uniform(0, np.pi)
     y, x = np.mgrid[0:height_px, 0:width_px].astype(np.float32)
     u = x * np.float32(np.cos(angle)) + y * np.float32(np.sin(angle))
@@ -202,7 +202,7 @@ def _clutter(canvas: Canvas, rng: np.random.Generator, count: int) -> Canvas:
 
 
 def _blurred_picture(rng: np.random.Generator, width_px: int, height_px: int) -> Canvas:
-    """Clutter in front of sky and ground, out of focus: the colour statistics of a photograph."""
+    """Defocused clutter in front of sky and ground, with the colour statistics of a photograph."""
     canvas = np.empty((height_px, width_px, 3), np.float32)
     horizon = int(height_px * rng.uniform(0.2, 0.8))
     canvas[:horizon] = _gradient(rng, width_px, height_px)[:horizon]

@@ -1,4 +1,4 @@
-"""Rendered layers, background and sensor put together to the bytes of an image."""
+"""Composition of rendered layers, background and sensor effects to an image."""
 
 import numpy as np
 from jaxtyping import UInt8
@@ -11,14 +11,14 @@ Array = np.ndarray
 
 
 def compose(rendered: RenderedScene, scene: Scene) -> UInt8[Array, "h w 3"]:
-    """Lay the render over the scene's background in linear light and expose it."""
+    """Composite the render over the scene's background in linear light, and apply the sensor effects."""
     height, width = rendered.alpha.shape
-    behind = sensor.linear_from_display(background.behind(scene, width, height))
+    behind = sensor.linear_from_display(background.render_background(scene, width, height))
     alpha = rendered.alpha[..., None]
     return sensor.expose(rendered.rgb_linear * alpha + behind * (1 - alpha), scene.sensor)
 
 
 def on_black(rendered: RenderedScene) -> UInt8[Array, "h w 3"]:
-    """The render alone on black, in display values: a hypothesis."""
+    """The render on black in display values, as for a hypothesis."""
     display = sensor.display_from_linear(rendered.rgb_linear * rendered.alpha[..., None])
     return np.asarray((display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""Panoramas (HDRIs): read, brought to one exposure, seen from a camera, and simplified to lamps."""
+"""Panoramas (HDRIs): reading, normalisation of the exposure, camera views, approximation by lamps."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,12 +17,12 @@ from synthgen.scene import Background, Environment, Light, Scene
 Array = np.ndarray
 
 SUFFIXES = (".hdr", ".exr")
-LIGHT_SIZE_PX = (512, 256)  # what lights a scene: finer only costs time, and a renderer's importance map is no finer
-VIEW_WIDTH_PX = 2048  # what is seen behind a scene
-IN_MEMORY = 8  # panoramas kept decoded; one is at most 14 MB
+LIGHT_SIZE_PX = (512, 256)  # resolution for lighting: a renderer's importance map is no finer
+VIEW_WIDTH_PX = 2048  # resolution as a background
+IN_MEMORY = 8  # decoded panoramas kept in memory, each at most 14 MB
 _CUT_LEVEL = 2.0
-_MOST_SUNS = 8
-_TOO_LITTLE = 0.01  # of the panorama's light
+_MAX_SUNS = 8
+_MIN_SUN_FRACTION = 0.01  # of the panorama's light
 _SUN_RADIUS_RAD = math.radians(15.0)
 _SMALLEST_SUN_RAD = 0.01
 _ASPECT_TOLERANCE = 0.02
@@ -30,11 +30,11 @@ _ASPECT_TOLERANCE = 0.02
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Panorama:
-    """A decoded panorama at unit level; row 0 is straight up, columns go round to the right as seen from inside.
+    """A decoded panorama at unit level; row 0 is straight up, columns go to the right as seen from inside.
 
     Attributes:
         light: (256, 512, 3) linear radiance.
-        view: (h, w, 3) the same in half precision and finer.
+        view: (h, w, 3) linear radiance at a higher resolution, in half precision.
     """
 
     light: Float[Array, "256 512 3"]
@@ -42,7 +42,7 @@ class Panorama:
 
 
 def list_hdris(folder: str | Path) -> tuple[str, ...]:
-    """Panoramas of a folder, sorted by name, subfolders included, every one decoded once.
+    """Panoramas of a folder, sorted by name, subfolders included; every file is decoded as a check.
 
     Raises:
         ConfigError: The folder is missing, holds no panorama, or one does not decode; the message names it.
@@ -50,20 +50,20 @@ def list_hdris(folder: str | Path) -> tuple[str, ...]:
     root = Path(folder)
     if not root.is_dir():
         raise ConfigError(f"--hdris {folder}: no such folder; give a folder with .hdr or .exr panoramas")
-    found = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in SUFFIXES))
-    if not found:
+    panoramas = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in SUFFIXES))
+    if not panoramas:
         raise ConfigError(f"--hdris {folder}: no panorama in it, expected {' or '.join(SUFFIXES)} files")
-    for path in found:
+    for path in panoramas:
         _decode(path)
-    return found
+    return panoramas
 
 
 @lru_cache(maxsize=IN_MEMORY)
 def load(path: str) -> Panorama:
     """Read a panorama and scale it to unit level.
 
-    At unit level a white matt surface shows radiance 1 in the mean of two places: facing straight up, and facing every
-    direction in turn. That depends on no turn about the vertical, and neither a sun nor an overcast sky is left dark.
+    At unit level the radiance of a white matt surface is 1 in the mean of two cases: facing up, and averaged over all
+    orientations. This level is invariant to rotations about the vertical, and suits both a sun and an overcast sky.
 
     Raises:
         ConfigError: The file does not decode.
@@ -85,10 +85,10 @@ def load(path: str) -> Panorama:
 def crop(
     environment: Environment, K: Float[Array, "3 3"], region_px: tuple[int, int, int, int]
 ) -> UInt8[Array, "h w 3"]:
-    """What a camera sees of the panorama in a region of its pixels, display colours.
+    """The panorama in a region of a camera's image plane, display colours.
 
     Args:
-        environment: Panorama with its turn.
+        environment: Panorama with its rotation.
         K: Camera matrix.
         region_px: (x0, y0, width, height).
     """
@@ -97,56 +97,57 @@ def crop(
     rays[..., 0] = ((x0 + np.arange(width) + 0.5 - K[0, 2]) / K[0, 0])[None, :]
     rays[..., 1] = ((y0 + np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])[:, None]
     rays[..., 2] = 1.0
-    x, y, z = np.moveaxis(rays @ environment.R_cam_env.astype(np.float32), -1, 0)  # row vectors: the inverse turn
+    x, y, z = np.moveaxis(rays @ environment.R_cam_env.astype(np.float32), -1, 0)  # row vectors: the inverse rotation
     view = load(environment.path).view
     rows, columns = view.shape[:2]
-    # one column is repeated on either side, so that interpolation goes on across the seam
+    # one column is repeated on either side for interpolation across the seam
     padded = np.concatenate([view[:, -1:], view, view[:, :1]], axis=1).astype(np.float32)
     u = (0.5 - np.arctan2(y, x) / np.float32(2 * np.pi)) * columns
     v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.float32(np.pi)) * rows
-    seen = cv2.remap(
+    radiance = cv2.remap(
         padded,
         (u + 0.5).astype(np.float32),
         (v - 0.5).astype(np.float32),
         cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
     )
-    display = display_from_linear(seen * np.float32(environment.strength))
+    display = display_from_linear(radiance * np.float32(environment.strength))
     return np.asarray((display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Split:
-    """A panorama's light in two: small bright places as suns, and what is left, which no renderer finds noisy.
+class SplitLight:
+    """A panorama's light, split into suns (small bright areas) and a residual that renders without noise.
 
     Attributes:
-        rest: (256, 512, 3) linear radiance without the suns' share.
-        ambient: (3,) its mean over all directions.
-        suns: Direction towards it in the panorama's frame, irradiance of each channel, and the angle it subtends, rad.
+        residual: (256, 512, 3) linear radiance without the suns.
+        ambient: (3,) mean of the residual over all directions.
+        suns: Of each sun the direction towards it in the panorama's frame, the irradiance of each channel, and the
+            angle that it subtends, rad.
     """
 
-    rest: Float[Array, "256 512 3"]
+    residual: Float[Array, "256 512 3"]
     ambient: Float[Array, "3"]
     suns: tuple[tuple[Float[Array, "3"], Float[Array, "3"], float], ...]
 
 
 @lru_cache(maxsize=IN_MEMORY)
-def split(path: str) -> Split:
-    """Split a panorama at unit level; irradiance summed over all directions stays what it was.
+def split_light(path: str) -> SplitLight:
+    """Split a panorama at unit level; the irradiance summed over all directions is preserved.
 
-    Radiance above a level of 2 is cut off. The brightest places get the light that was cut off around them, as suns of
-    their size; what is then left of it is spread over its surroundings.
+    Radiance above a level of 2 is cut off. The light cut off around the brightest areas becomes suns of the same size;
+    the remainder of the light cut off is blurred.
 
     Raises:
         ConfigError: The file does not decode.
     """
     light = load(path).light
     directions, weights = _sphere(*LIGHT_SIZE_PX)
-    kept = light * np.minimum(1.0, _CUT_LEVEL / np.maximum(light.mean(axis=2, keepdims=True), 1e-9))
-    cut = (light - kept) * weights[..., None]
+    clipped = light * np.minimum(1.0, _CUT_LEVEL / np.maximum(light.mean(axis=2, keepdims=True), 1e-9))
+    cut = (light - clipped) * weights[..., None]
     energy, total = cut.mean(axis=2), float((light.mean(axis=2) * weights).sum())
     suns: list[tuple[Float[Array, "3"], Float[Array, "3"], float]] = []
-    while len(suns) < _MOST_SUNS and energy.max() > 0.0 and energy.sum() > _TOO_LITTLE * total:
+    while len(suns) < _MAX_SUNS and energy.max() > 0.0 and energy.sum() > _MIN_SUN_FRACTION * total:
         peak = directions[np.unravel_index(energy.argmax(), energy.shape)]
         here = (directions @ peak > math.cos(_SUN_RADIUS_RAD)) & (energy > 0.0)
         towards = (energy[here][:, None] * directions[here]).sum(axis=0)
@@ -155,15 +156,15 @@ def split(path: str) -> Split:
         spread = math.sqrt(float((energy[here] * angle**2).sum() / energy[here].sum()))
         suns.append((towards, cut[here].sum(axis=0).astype(np.float64), max(2.0 * spread, _SMALLEST_SUN_RAD)))
         cut[here], energy[here] = 0.0, 0.0
-    rest = kept + _spread(cut, weights)
-    ambient = (rest * weights[..., None]).sum(axis=(0, 1)) / (4 * math.pi)
-    return Split(rest=rest.astype(np.float32), ambient=ambient.astype(np.float64), suns=tuple(suns))
+    residual = clipped + _blurred_radiance(cut, weights)
+    ambient = (residual * weights[..., None]).sum(axis=(0, 1)) / (4 * math.pi)
+    return SplitLight(residual=residual.astype(np.float32), ambient=ambient.astype(np.float64), suns=tuple(suns))
 
 
-def _spread(cut: Float[Array, "h w 3"], weights: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
-    """Radiance of light (radiance times solid angle) that is blurred by about 20 degrees; none is lost."""
+def _blurred_radiance(cut: Float[Array, "h w 3"], weights: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """Radiance of light (radiance times solid angle) after a blur of about 20 degrees that preserves the total."""
     around = cut.shape[1] // 2
-    padded = np.concatenate([cut[:, -around:], cut, cut[:, :around]], axis=1)  # the columns go round
+    padded = np.concatenate([cut[:, -around:], cut, cut[:, :around]], axis=1)  # columns are periodic
     blurred = cv2.GaussianBlur(padded, (0, 0), cut.shape[1] / 18, borderType=cv2.BORDER_REFLECT)[:, around:-around]
     solid_angle = cv2.GaussianBlur(weights, (0, 0), cut.shape[1] / 18, borderType=cv2.BORDER_REFLECT)
     radiance = blurred / solid_angle[..., None]
@@ -172,12 +173,12 @@ def _spread(cut: Float[Array, "h w 3"], weights: Float[Array, "h w"]) -> Float[A
 
 
 def with_suns(scene: Scene) -> Scene:
-    """The scene with the suns of its panorama among its lamps; the panorama is then to light with `Split.rest` only."""
+    """The scene with the panorama's suns as lamps; the panorama then contributes `SplitLight.residual` only."""
     if scene.environment is None:
         return scene
     environment = scene.environment
     suns = []
-    for towards, irradiance, size_rad in split(environment.path).suns:
+    for towards, irradiance, size_rad in split_light(environment.path).suns:
         x, y, z = (environment.R_cam_env @ towards).tolist()
         brightest = float(irradiance.max())
         r, g, b = (irradiance / brightest).tolist()
@@ -194,13 +195,13 @@ def with_suns(scene: Scene) -> Scene:
 
 
 def with_lamps(scene: Scene) -> Scene:
-    """The scene with its panorama replaced by suns and even light, for engines that know lamps only.
+    """The scene with its panorama replaced by suns and ambient light, for engines without panoramas.
 
-    A background that shows the panorama is replaced too: this scene is for its light.
+    A background of kind `environment` is replaced too: this scene is for lighting only.
     """
     if scene.environment is None:
         return scene
-    ambient = split(scene.environment.path).ambient * scene.environment.strength
+    ambient = split_light(scene.environment.path).ambient * scene.environment.strength
     r, g, b = (np.array(scene.ambient_rgb) + ambient).tolist()
     return replace(with_suns(scene), ambient_rgb=(r, g, b), environment=None, background=Background())
 
@@ -220,14 +221,14 @@ def _decode(path: str) -> Float[Array, "h w 3"]:
     image = _read_exr(path) if path.lower().endswith(".exr") else cv2.imread(path, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.shape[2] < 3 or image.dtype != np.float32:
         raise ConfigError(
-            f"{path}: does not decode as an HDRI, expected a panorama in {' or '.join(SUFFIXES)}; "
-            "export it again or take it out of the --hdris folder"
+            f"{path}: cannot be decoded as an HDRI, expected a panorama in {' or '.join(SUFFIXES)}; "
+            "export it again or remove it from the --hdris folder"
         )
     height, width = image.shape[:2]
     if height < 2 or abs(width / height - 2.0) > _ASPECT_TOLERANCE:
         raise ConfigError(
-            f"{path}: the picture is {width} x {height} px, expected an equirectangular panorama, twice as wide as "
-            "high; take it out of the --hdris folder"
+            f"{path}: the image is {width} x {height} px, expected an equirectangular panorama, twice as wide as "
+            "high; remove it from the --hdris folder"
         )
     rgb = image[..., :3] if path.lower().endswith(".exr") else image[..., 2::-1]
     return np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=6e4, neginf=0.0), 0.0).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Procedural textures that fill space; Blender's nodes evaluate the same formula (`blender/materials.py`)."""
+"""Procedural solid textures; Blender's nodes evaluate the same formula (`engines/blender/materials.py`)."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -9,11 +9,11 @@ from synthgen.scene import Material, Pattern
 Array = np.ndarray
 
 
-def share(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
-    """Share of the accent colour at points in object coordinates, in [0, 1].
+def accent_weight(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """Weight of the accent colour at points in object coordinates, in [0, 1].
 
     Args:
-        pattern: Which texture.
+        pattern: Texture.
         p_obj_m: (n, 3) points on the surface, metres.
     """
     bent = pattern.bend * np.sin(p_obj_m @ np.asarray(pattern.warp))
@@ -22,11 +22,11 @@ def share(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
 
 
 def paint(rgb: UInt8[Array, "n 3"], material: Material, p_obj_m: Float[Array, "n 3"]) -> UInt8[Array, "n 3"]:
-    """Display colours of a white surface with the material's base colour and pattern laid on.
+    """Display colours of a lit surface with the material's base colour and pattern.
 
     Args:
-        rgb: How a white surface is lit, display values.
-        material: With a base colour and a pattern.
+        rgb: Shading of a white surface, display values.
+        material: Material with a base colour and a pattern.
         p_obj_m: (n, 3) points on the surface in object coordinates, metres.
     """
     assert material.pattern is not None and material.base_rgb is not None
@@ -34,6 +34,6 @@ def paint(rgb: UInt8[Array, "n 3"], material: Material, p_obj_m: Float[Array, "n
         linear_from_display((np.array(c) * 255 + 0.5).astype(np.uint8)[None, None])[0]
         for c in (material.base_rgb, material.pattern.accent_rgb)
     )
-    weight = share(material.pattern, p_obj_m)[:, None]
+    weight = accent_weight(material.pattern, p_obj_m)[:, None]
     colour = display_from_linear((base * (1 - weight) + accent * weight)[None])[0]
     return np.asarray((rgb * colour + 0.5).astype(np.uint8))

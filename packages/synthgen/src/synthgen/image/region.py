@@ -1,4 +1,4 @@
-"""Which pixels a scene's render must cover, and windows and cameras in its scale."""
+"""Image regions to render for crop windows, and windows and cameras in a scaled image."""
 
 import math
 from collections.abc import Sequence
@@ -10,25 +10,25 @@ from posecore.window import Window
 
 Array = np.ndarray
 
-_REGION_MARGIN_PX = 3  # what interpolation and the anti-aliasing blur of a cut reach for beyond the window
+_REGION_MARGIN_PX = 3  # reach of interpolation and of the anti-aliasing blur beyond a crop window
 
 
 def inside_image(window: Window, patch_px: int, camera: Camera) -> Bool[Array, "p p"]:
-    """Which patch pixels lie inside the camera's image."""
+    """Mask of the patch pixels inside the camera's image."""
     centres = (np.arange(patch_px) + 0.5) * (window.side_px / patch_px)
     x, y = window.x0_px + centres, window.y0_px + centres
     return ((y >= 0) & (y < camera.height_px))[:, None] & ((x >= 0) & (x < camera.width_px))[None, :]
 
 
-def holds(window: Window, box_px: Float[Array, "4"]) -> bool:
+def contains(window: Window, box_px: Float[Array, "4"]) -> bool:
     """Whether a box (x0, y0, x1, y1) lies wholly inside a window."""
     x0, y0, x1, y1 = box_px
     right, bottom = window.x0_px + window.side_px, window.y0_px + window.side_px
     return bool(x0 >= window.x0_px and y0 >= window.y0_px and x1 <= right and y1 <= bottom)
 
 
-def bounds(windows: Sequence[Window]) -> tuple[int, int, int, int]:
-    """Whole pixels (x0, y0, width, height) that hold the windows, with a margin."""
+def pixel_bounds(windows: Sequence[Window]) -> tuple[int, int, int, int]:
+    """Box of whole pixels (x0, y0, width, height) around the windows, with a margin."""
     m = _REGION_MARGIN_PX
     x0 = int(np.floor(min(w.x0_px for w in windows))) - m
     y0 = int(np.floor(min(w.y0_px for w in windows))) - m
@@ -37,16 +37,16 @@ def bounds(windows: Sequence[Window]) -> tuple[int, int, int, int]:
     return x0, y0, x1 - x0, y1 - y0
 
 
-def region_of(windows: Sequence[Window], camera: Camera) -> tuple[int, int, int, int]:
-    """The part of the image that the windows need; what they show outside of it is filled when they are cut."""
-    x0, y0, width, height = bounds(windows)
+def render_region(windows: Sequence[Window], camera: Camera) -> tuple[int, int, int, int]:
+    """Region (x0, y0, width, height) of the image under the windows; crops are filled outside the image."""
+    x0, y0, width, height = pixel_bounds(windows)
     left, top = max(x0, 0), max(y0, 0)
     right, bottom = min(x0 + width, camera.width_px), min(y0 + height, camera.height_px)
     return left, top, right - left, bottom - top
 
 
 def scaled_camera(camera: Camera, scale: float) -> Camera:
-    """The camera whose image is this one resized; a last column or row that is cut off counts as a whole one."""
+    """The camera of the resized image, its size rounded up to whole pixels."""
     if scale == 1.0:
         return camera
     size = (math.ceil(camera.width_px * scale), math.ceil(camera.height_px * scale))
@@ -58,6 +58,6 @@ def scaled_window(window: Window, scale: float) -> Window:
     return Window(x0_px=window.x0_px * scale, y0_px=window.y0_px * scale, side_px=window.side_px * scale)
 
 
-def within(window: Window, region_px: tuple[int, int, int, int]) -> Window:
-    """The window in a region's own pixels."""
+def window_in_region(window: Window, region_px: tuple[int, int, int, int]) -> Window:
+    """The window in a region's pixels."""
     return Window(x0_px=window.x0_px - region_px[0], y0_px=window.y0_px - region_px[1], side_px=window.side_px)

@@ -1,4 +1,4 @@
-"""What a camera does to the light: exposure, white balance, defocus and motion blur, noise, JPEG."""
+"""Camera effects: exposure, white balance, defocus and motion blur, noise, JPEG."""
 
 import cv2
 import numpy as np
@@ -15,13 +15,13 @@ def linear_from_display(rgb: UInt8[Array, "h w 3"]) -> Float[Array, "h w 3"]:
 
 
 def display_from_linear(rgb_linear: Float[Array, "h w 3"]) -> Float[Array, "h w 3"]:
-    """Display (sRGB) values of linear light, both in [0, 1]; more light than 1 saturates."""
+    """Display (sRGB) values of linear light, both in [0, 1]; linear light above 1 saturates."""
     x = np.clip(rgb_linear, 0.0, 1.0).astype(np.float32)
     return np.where(x <= 0.0031308, x * np.float32(12.92), np.float32(1.055) * cv2.pow(x, 1 / 2.4) - np.float32(0.055))
 
 
 def expose(rgb_linear: Float[Array, "h w 3"], sensor: Sensor) -> UInt8[Array, "h w 3"]:
-    """Turn linear light into the bytes of a camera image.
+    """Convert linear light to the bytes of a camera image.
 
     Lens (blur) first, then the sensor's gains, then noise in display units, then JPEG: the order in a real camera.
     """
@@ -45,7 +45,7 @@ def expose(rgb_linear: Float[Array, "h w 3"], sensor: Sensor) -> UInt8[Array, "h
 
 
 def _motion_kernel(length_px: float, angle_rad: float) -> Float[Array, "k k"]:
-    """A straight line of the given length, antialiased, summing to 1 and centred, so that nothing shifts."""
+    """An antialiased straight line of the given length, centred (no shift), with sum 1."""
     half = int(np.ceil(length_px / 2)) + 1
     kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
     for s in np.linspace(-length_px / 2, length_px / 2, 4 * half + 1):

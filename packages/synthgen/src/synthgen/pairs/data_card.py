@@ -19,9 +19,9 @@ from posecore.shard.layout import check_same_card, read_card
 from posecore.store import open_store
 
 from synthgen.config import CutConfig, SynthConfig, migrate
-from synthgen.draw.target import Target, make_targets
+from synthgen.draw.target import TargetObject, make_targets
 from synthgen.inputs.assets import Assets
-from synthgen.pairs.cut_plan import Plan, centre_m
+from synthgen.pairs.cut_plan import Plan
 
 UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
 DEPTH_STEPS = 65535  # depth is stored in 16 bits
@@ -68,7 +68,7 @@ def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool 
     """
     camera = plan.images[0].camera
     deepest_m = max(
-        float(centre_m(T, dataset.mesh(obj_id))[2]) + dataset.mesh(obj_id).diameter_m
+        float(dataset.mesh(obj_id).center_cam_m(T)[2]) + dataset.mesh(obj_id).diameter_m
         for image in plan.images
         for obj_id, T in (
             *((gt.obj_id, gt.T_cam_obj) for gt in image.annotated),
@@ -147,7 +147,7 @@ def create_writer(url: str, card: Mapping[str, Any]) -> ShardWriter:
     return ShardWriter.create(url, stored)
 
 
-def depth_step_m(targets: Sequence[Target]) -> float:
+def depth_step_m(targets: Sequence[TargetObject]) -> float:
     """Depth quantisation of the deepest scene of any object, metres."""
     return _depth_step_m(max(t.distance_m[1] + t.reach_m for t in targets))
 

@@ -1,4 +1,4 @@
-"""Pairs of scene and hypothesis patches with their labels: all samples of one scene at a time."""
+"""Pairs of scene and hypothesis patches with their labels, all samples of a scene at once."""
 
 import math
 import os
@@ -18,14 +18,23 @@ from posecore.window import Window, centred, cut, fixed_window
 
 from synthgen.config import SynthConfig
 from synthgen.draw import scene_draw
+from synthgen.draw.poses import draw_hypothesis, fraction_inside, target_box
 from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.draw.rejection import Tally, nothing_accepted
 from synthgen.draw.scene_draw import SceneDraw
-from synthgen.draw.target import Target
+from synthgen.draw.target import TargetObject
 from synthgen.engine import Engine, RenderedScene
 from synthgen.engines.make import make_engine
 from synthgen.image.compose import compose, on_black
-from synthgen.image.region import bounds, holds, inside_image, region_of, scaled_camera, scaled_window, within
+from synthgen.image.region import (
+    contains,
+    inside_image,
+    pixel_bounds,
+    render_region,
+    scaled_camera,
+    scaled_window,
+    window_in_region,
+)
 from synthgen.inputs.assets import Assets
 from synthgen.scene import Light, Scene, SceneObject
 
@@ -33,7 +42,7 @@ Array = np.ndarray
 
 MAX_ATTEMPTS = 100
 MAX_HYPOTHESIS_ATTEMPTS = 50
-_GLANCE_PX = 64  # side of the small render that decides whether an occluder hides too much
+_VISIBILITY_PX = 64  # side of the low-resolution render that measures the visible fraction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,32 +51,32 @@ class Hypothesis:
 
     Attributes:
         T_cam_obj: Perturbed pose.
-        window: Where both patches are cut.
+        window: Crop window of both patches.
         K_crop: Camera matrix of the patch.
-        truth_depth_m: Camera z of the object alone at its true pose.
+        gt_depth_m: Camera z of the object alone at its true pose.
         depth_m: Camera z of the object at the hypothesis.
         rgb: Rasterised hypothesis on black.
-        rejected: Draws before this one.
+        rejected: Number of rejected draws before this one.
     """
 
     T_cam_obj: Float[Array, "4 4"]
     window: Window
     K_crop: Float[Array, "3 3"]
-    truth_depth_m: Float[Array, "p p"]
+    gt_depth_m: Float[Array, "p p"]
     depth_m: Float[Array, "p p"]
     rgb: UInt8[Array, "p p 3"]
     rejected: int
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Shot:
-    """A rendered scene.
+class RenderedImage:
+    """A rendered region of a scene's image.
 
     Attributes:
         rendered: The engine's layers.
-        image: Composed and exposed.
+        image: Camera image: the render over the background, exposed.
         region_px: (x0, y0, width, height) in the scaled image.
-        scale: Pixels of the render for one pixel of the camera.
+        scale: Pixels of the render per pixel of the camera.
     """
 
     rendered: RenderedScene
@@ -77,12 +86,12 @@ class Shot:
 
 
 class PairMaker:
-    """Makes samples. One per process: it holds the renderers.
+    """Makes samples. One per process, because it holds the renderers.
 
     Args:
-        config: Recipe.
-        targets: Objects.
-        assets: Photographs, panoramas and the like; none by default.
+        config: Configuration.
+        targets: Target objects.
+        assets: Photographs, panoramas and occluder meshes; none by default.
         threads: Threads of a Blender engine, 0 for all cores; results do not depend on it.
 
     Raises:
@@ -90,7 +99,7 @@ class PairMaker:
     """
 
     def __init__(
-        self, config: SynthConfig, targets: Sequence[Target], assets: Assets | None = None, *, threads: int = 0
+        self, config: SynthConfig, targets: Sequence[TargetObject], assets: Assets | None = None, *, threads: int = 0
     ) -> None:
         self.config = config
         self.targets = tuple(targets)
@@ -101,7 +110,7 @@ class PairMaker:
             meshes |= {target.obj_id: target.mesh, **target.shapes, **target.tables}
         self._engines: dict[str, Engine] = {}
         for name in dict.fromkeys((config.engine, config.hypothesis_engine)):
-            # the rasteriser's own hypothesis render needs no engine
+            # hypotheses by the rasteriser need no engine
             if name != "raster" or name == config.engine:
                 self._engines[name] = make_engine(name, threads=threads, device=config.device)
                 self._engines[name].load(meshes)
@@ -114,24 +123,24 @@ class PairMaker:
         self._rasteriser.close()
 
     def samples(self, scene_index: int, keep: int | None = None, first_attempt: int = 0) -> dict[str, Array]:
-        """All samples of a scene, every field of the shard table with the hypotheses in front.
+        """All samples of a scene: every field of the shard table, hypotheses on the first axis.
 
         Args:
-            scene_index: Which scene.
-            keep: Only this many hypotheses; the scene and the ones kept are the same as without it.
-            first_attempt: Draws of the scene before this one are left out, e.g. because one crashes the renderer.
+            scene_index: Index of the scene.
+            keep: Number of hypotheses to keep; it changes neither the scene nor the kept hypotheses.
+            first_attempt: First draw of the scene to try, e.g. because an earlier one crashes the renderer.
 
         Raises:
-            ConfigError: No acceptable scene or hypothesis is found with this configuration.
+            ConfigError: No acceptable scene or hypothesis exists with this configuration.
         """
         tally = Tally()
         draw, rejected_scenes = self.accepted_scene(scene_index, first_attempt, tally)
         while (hypotheses := self._hypotheses(draw, scene_index, tally)) is None:
             tally["no hypothesis"] += 1
             draw, rejected_scenes = self.accepted_scene(scene_index, rejected_scenes + 1, tally)
-        shot = self._shoot(draw, [h.window for h in hypotheses])
+        image = self._render(draw, [h.window for h in hypotheses])
         rows = [
-            self._sample(draw, scene_index, number, hypothesis, rejected_scenes, shot)
+            self._sample(draw, scene_index, number, hypothesis, rejected_scenes, image)
             for number, hypothesis in enumerate(hypotheses[:keep])
         ]
         return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
@@ -139,72 +148,73 @@ class PairMaker:
     def accepted_scene(
         self, scene_index: int, first_attempt: int = 0, tally: Tally | None = None
     ) -> tuple[SceneDraw, int]:
-        """Draw scenes until one shows enough of its object.
+        """Draw scenes until the object is inside the image, large and visible enough.
 
         Args:
-            scene_index: Which scene.
-            first_attempt: Draws before this one are known to be unusable.
-            tally: Why draws were rejected so far; what this call rejects is added.
+            scene_index: Index of the scene.
+            first_attempt: First draw to try.
+            tally: Rejections by reason; those of this call are added.
 
         Returns:
-            The scene and how many were rejected before it.
+            The scene and the number of draws rejected before it.
 
         Raises:
-            ConfigError: None of many draws is acceptable.
+            ConfigError: No draw is acceptable.
         """
         tally = Tally() if tally is None else tally
         for attempt in range(first_attempt, MAX_ATTEMPTS):
             draw = scene_draw.draw_scene(self.config, self.targets, self.assets, Purpose.PAIRS, scene_index, attempt)
-            box = scene_draw.target_box(draw.target, self.camera, draw.T_cam_obj)
-            inside = scene_draw.share_inside(box, self.camera)
+            box = target_box(draw.target, self.camera, draw.T_cam_obj)
+            inside = fraction_inside(box, self.camera)
             if inside < self.config.view.min_inside:
                 tally["outside"] += 1
                 continue
-            draw = scene_draw.slide_in(draw, self.config, partial(self._visible, box))
-            area_px, visible = self._glance(draw, box)
+            draw = scene_draw.adjust_visibility(draw, self.config, partial(self._visible_fraction, box))
+            area_px, visible = self._area_and_visibility(draw, box)
             if area_px < self.config.window.min_area_px:
                 tally["small"] += 1
             elif visible * inside < self.config.occluders.min_visible:
                 tally["hidden"] += 1
             else:
                 return draw, attempt
-        target = self.targets[scene_draw.target_of(self.config.seed, Purpose.PAIRS, scene_index, len(self.targets))]
+        target = self.targets[scene_draw.target_index(self.config.seed, Purpose.PAIRS, scene_index, len(self.targets))]
         raise nothing_accepted(scene_index, target.name, tally, self.config)
 
-    def _shoot(self, draw: SceneDraw, windows: Sequence[Window]) -> Shot:
-        """Render the part of the image that the windows show, no finer than the patches can show it."""
+    def _render(self, draw: SceneDraw, windows: Sequence[Window]) -> RenderedImage:
+        """Render the region of the image that the windows need, at most at the patches' resolution."""
         scale = min(1.0, self.config.patch_px / draw.target.window_side_px)
         camera = scaled_camera(self.camera, scale)
-        region = region_of([scaled_window(w, scale) for w in windows], camera)
+        region = render_region([scaled_window(w, scale) for w in windows], camera)
         scene = draw.scene(camera, region, self.config.samples)
         rendered = self._engines[self.config.engine].render(scene)
-        return Shot(rendered=rendered, image=compose(rendered, scene), region_px=region, scale=scale)
+        return RenderedImage(rendered=rendered, image=compose(rendered, scene), region_px=region, scale=scale)
 
-    def _visible(self, box: Float[Array, "4"], draw: SceneDraw) -> float:
-        """The object's visible share at a glance."""
-        return self._glance(draw, box)[1]
+    def _visible_fraction(self, box: Float[Array, "4"], draw: SceneDraw) -> float:
+        return self._area_and_visibility(draw, box)[1]
 
-    def _glance(self, draw: SceneDraw, box: Float[Array, "4"]) -> tuple[float, float]:
-        """Look at low resolution: the silhouette's area in patch pixels and the share that occluders leave free."""
+    def _area_and_visibility(self, draw: SceneDraw, box: Float[Array, "4"]) -> tuple[float, float]:
+        """The silhouette's area in patch pixels and its visible fraction, from a low-resolution render."""
         x0, y0, x1, y1 = box
         window = centred((x0 + x1) / 2, (y0 + y1) / 2, max(x1 - x0, y1 - y0))
-        K = crop_K(self.camera.K, window, _GLANCE_PX)
+        K = crop_K(self.camera.K, window, _VISIBILITY_PX)
         alone = self._rasteriser.render(
-            draw.target.obj_id, K, draw.T_cam_obj[None], _GLANCE_PX, _GLANCE_PX, rgb=False
+            draw.target.obj_id, K, draw.T_cam_obj[None], _VISIBILITY_PX, _VISIBILITY_PX, rgb=False
         ).mask.sum()
-        area_px = float(alone) * (window.side_px / _GLANCE_PX * self.config.patch_px / draw.target.window_side_px) ** 2
+        area_px = (
+            float(alone) * (window.side_px / _VISIBILITY_PX * self.config.patch_px / draw.target.window_side_px) ** 2
+        )
         if not draw.others or not alone:
             return area_px, 1.0
         instances = [Instance(obj_id=draw.target.obj_id, T_cam_obj=draw.T_cam_obj)]
         instances += [Instance(obj_id=o.mesh_key, T_cam_obj=o.T_cam_obj) for o in draw.others]
-        glance = self._rasteriser.render_scene(instances, K, _GLANCE_PX, _GLANCE_PX, rgb=False)
-        visible = (glance.instance == 0).sum()
+        scene = self._rasteriser.render_scene(instances, K, _VISIBILITY_PX, _VISIBILITY_PX, rgb=False)
+        visible = (scene.instance == 0).sum()
         return area_px, float(visible / alone)
 
     def _hypotheses(self, draw: SceneDraw, scene_index: int, tally: Tally) -> list[Hypothesis] | None:
-        """Draw hypotheses until each has one whose silhouettes lie in the window and are large enough.
+        """Draw each hypothesis until both silhouettes are inside the window and large enough.
 
-        None when the scene does not allow that: then another scene is drawn.
+        None if the scene does not allow it; another scene is then drawn.
         """
         accepted: dict[int, Hypothesis] = {}
         attempts = dict.fromkeys(range(self.config.hypotheses_per_scene), 0)
@@ -216,9 +226,9 @@ class PairMaker:
                     if candidate is None:
                         return None
                     candidates[number] = candidate
-            for number, hypothesis in self._look(draw, candidates, attempts).items():
-                small = min((hypothesis.truth_depth_m > 0).sum(), (hypothesis.depth_m > 0).sum())
-                if small >= self.config.window.min_area_px:
+            for number, hypothesis in self._rasterise(draw, candidates, attempts).items():
+                area_px = min((hypothesis.gt_depth_m > 0).sum(), (hypothesis.depth_m > 0).sum())
+                if area_px >= self.config.window.min_area_px:
                     accepted[number] = hypothesis
                 else:
                     tally["too small"] += 1
@@ -228,42 +238,42 @@ class PairMaker:
     def _next_candidate(
         self, draw: SceneDraw, scene_index: int, number: int, attempts: dict[int, int], tally: Tally
     ) -> tuple[Float[Array, "4 4"], Window] | None:
-        """The next draw of a hypothesis whose window holds both silhouettes' boxes, None after many that do not."""
-        truth = scene_draw.target_box(draw.target, self.camera, draw.T_cam_obj)
+        """The next draw of a hypothesis whose window contains both silhouettes' boxes, None after too many draws."""
+        gt_box = target_box(draw.target, self.camera, draw.T_cam_obj)
         while attempts[number] < MAX_HYPOTHESIS_ATTEMPTS:
             rng = stream(self.config.seed, Purpose.PAIRS, Subject.HYPOTHESIS, scene_index, number, attempts[number])
-            T = scene_draw.draw_hypothesis(rng, self.config.perturbation, draw.T_cam_obj, draw.target.mesh)
-            box = scene_draw.target_box(draw.target, self.camera, T)
+            T = draw_hypothesis(rng, self.config.perturbation, draw.T_cam_obj, draw.target.mesh)
+            box = target_box(draw.target, self.camera, T)
             if np.isfinite(box).all():
                 window = fixed_window(draw.target.hull_m, self.camera.K, T, draw.target.window_side_px)
-                if holds(window, truth) and holds(window, box):
+                if contains(window, gt_box) and contains(window, box):
                     return T, window
             tally["left window"] += 1
             attempts[number] += 1
         return None
 
-    def _look(
+    def _rasterise(
         self,
         draw: SceneDraw,
         candidates: Mapping[int, tuple[Float[Array, "4 4"], Window]],
         attempts: Mapping[int, int],
     ) -> dict[int, Hypothesis]:
-        """Rasterise truth and hypotheses in their windows, at the patch's own resolution."""
+        """Rasterise ground truth and hypotheses in their windows, at the patch's resolution."""
         p, obj_id = self.config.patch_px, draw.target.obj_id
         K_crop = np.stack([crop_K(self.camera.K, window, p) for _, window in candidates.values()])
-        T_true = np.repeat(draw.T_cam_obj[None], len(candidates), axis=0)
+        T_gt = np.repeat(draw.T_cam_obj[None], len(candidates), axis=0)
         T_hypothesis = np.stack([T for T, _ in candidates.values()])
-        truth = self._rasteriser.render(obj_id, K_crop, T_true, p, p, rgb=False)
-        wrong = self._rasteriser.render(obj_id, K_crop, T_hypothesis, p, p)
-        assert wrong.rgb is not None
+        gt = self._rasteriser.render(obj_id, K_crop, T_gt, p, p, rgb=False)
+        perturbed = self._rasteriser.render(obj_id, K_crop, T_hypothesis, p, p)
+        assert perturbed.rgb is not None
         return {
             number: Hypothesis(
                 T_cam_obj=T,
                 window=window,
                 K_crop=K_crop[i],
-                truth_depth_m=truth.depth_m[i],
-                depth_m=wrong.depth_m[i],
-                rgb=wrong.rgb[i],
+                gt_depth_m=gt.depth_m[i],
+                depth_m=perturbed.depth_m[i],
+                rgb=perturbed.rgb[i],
                 rejected=attempts[number],
             )
             for i, (number, (T, window)) in enumerate(candidates.items())
@@ -276,28 +286,28 @@ class PairMaker:
         number: int,
         hypothesis: Hypothesis,
         rejected_scenes: int,
-        shot: Shot,
+        image: RenderedImage,
     ) -> dict[str, Array]:
         config, window, p = self.config, hypothesis.window, self.config.patch_px
-        local = within(scaled_window(window, shot.scale), shot.region_px)
+        local = window_in_region(scaled_window(window, image.scale), image.region_px)
         scene_depth_m, scene_mask = _scene_labels(
-            hypothesis.truth_depth_m,
-            cut(shot.rendered.depth_m, local, p, interpolation="nearest"),
-            cut(shot.rendered.index, local, p, interpolation="nearest", fill=-1),
+            hypothesis.gt_depth_m,
+            cut(image.rendered.depth_m, local, p, interpolation="nearest"),
+            cut(image.rendered.index, local, p, interpolation="nearest", fill=-1),
             inside_image(window, p, self.camera),
             reach_px=math.ceil(max(1.0, p / window.side_px)) + 1,
         )
-        amodal = hypothesis.truth_depth_m > 0
+        amodal = hypothesis.gt_depth_m > 0
         shape = hypothesis.depth_m > 0
         rng = stream(config.seed, Purpose.PAIRS, Subject.CONTOUR, scene_index, number)
         n = config.contour_points
         values = {
-            "scene_rgb": cut(shot.image, local, p, interpolation="area"),
+            "scene_rgb": cut(image.image, local, p, interpolation="area"),
             "hypothesis_rgb": self._hypothesis_rgb(draw, hypothesis),
             "scene_depth_m": scene_depth_m,
             "hypothesis_depth_m": hypothesis.depth_m,
             "scene_mask": scene_mask,
-            "scene_contour_cam_m": sample_contour(amodal, hypothesis.truth_depth_m, hypothesis.K_crop, n, rng),
+            "scene_contour_cam_m": sample_contour(amodal, hypothesis.gt_depth_m, hypothesis.K_crop, n, rng),
             "hypothesis_contour_cam_m": sample_contour(shape, hypothesis.depth_m, hypothesis.K_crop, n, rng),
             "scene_distance_px": distance_transform_px(contour_mask(amodal)),
             "hypothesis_distance_px": distance_transform_px(contour_mask(shape)),
@@ -317,7 +327,7 @@ class PairMaker:
         engine = self._engines.get(self.config.hypothesis_engine)
         if self.config.hypothesis_engine == "raster" or engine is None:
             return hypothesis.rgb
-        region = bounds([hypothesis.window])
+        region = pixel_bounds([hypothesis.window])
         scene = Scene(
             camera=self.camera,
             region_px=region,
@@ -328,7 +338,7 @@ class PairMaker:
             render_seed=draw.render_seed,
         )
         image = on_black(engine.render(scene))
-        return cut(image, within(hypothesis.window, region), self.config.patch_px, interpolation="area")
+        return cut(image, window_in_region(hypothesis.window, region), self.config.patch_px, interpolation="area")
 
 
 def concatenate(scenes: Iterable[Mapping[str, Array]]) -> dict[str, Array]:
@@ -338,7 +348,7 @@ def concatenate(scenes: Iterable[Mapping[str, Array]]) -> dict[str, Array]:
 
 
 def _scene_labels(
-    truth_depth_m: Float[Array, "p p"],
+    gt_depth_m: Float[Array, "p p"],
     engine_depth_m: Float[Array, "p p"],
     engine_index: Array,
     inside: Bool[Array, "p p"],
@@ -346,37 +356,37 @@ def _scene_labels(
 ) -> tuple[Float[Array, "p p"], UInt8[Array, "p p"]]:
     """Depth and mask bits of the scene patch.
 
-    The object's own silhouette and depth are exact at the patch's resolution; what hides it comes from the engine's
-    layers, cut to nearest. A silhouette pixel is hidden where the engine drew another object nearer than it. Asking
-    for index 0 instead would lose a fringe of up to a camera pixel all around the object.
+    The object's silhouette and depth are exact at the patch's resolution; occlusion comes from the engine's layers,
+    resampled to nearest. A silhouette pixel is hidden where the engine rendered another object nearer to the camera.
+    The test for index 0 instead would lose a fringe of up to a camera pixel all around the object.
 
     Args:
-        truth_depth_m: The object alone.
-        engine_depth_m: The scene.
-        engine_index: The scene.
-        inside: What lies in the camera's image.
-        reach_px: More patch pixels than one of the engine's is wide.
+        gt_depth_m: Depth of the object alone.
+        engine_depth_m: Depth of the scene.
+        engine_index: Object index of the scene.
+        inside: Patch pixels inside the camera's image.
+        reach_px: Radius in patch pixels, larger than an engine's pixel.
     """
-    amodal = truth_depth_m > 0
+    amodal = gt_depth_m > 0
     other = engine_index > 0
-    visible = amodal & inside & ~(other & (engine_depth_m < truth_depth_m))
+    visible = amodal & inside & ~(other & (engine_depth_m < gt_depth_m))
     other_depth_m = np.where(other & inside, engine_depth_m, np.float32(0.0))
-    # In the fringe outside the exact silhouette, where the engine's coarser pixel still shows the object, lies what
-    # lies next to it: another object (a table goes on there), or background.
+    # In the fringe outside the exact silhouette, where the engine's coarser pixels still show the object, the depth is
+    # that of the neighbourhood: another object (the table), or background.
     fringe = (engine_index == 0) & ~amodal & inside
-    near = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
-    other_depth_m = np.where(fringe, cv2.dilate(other_depth_m, near), other_depth_m)
-    depth = np.where(visible, truth_depth_m, other_depth_m)
+    neighbourhood = np.ones((2 * reach_px + 1, 2 * reach_px + 1), np.uint8)
+    other_depth_m = np.where(fringe, cv2.dilate(other_depth_m, neighbourhood), other_depth_m)
+    depth = np.where(visible, gt_depth_m, other_depth_m)
     foreground = visible | (other_depth_m > 0)
     mask = amodal * BIT_OBJECT + visible * BIT_VISIBLE + foreground * BIT_FOREGROUND
     return depth.astype(np.float32), mask.astype(np.uint8)
 
 
 def limit_threads(threads: int) -> None:
-    """Keep OpenCV and Mesa's software GL from starting a thread per core in every process. Call before any render.
+    """Limit the threads of OpenCV and Mesa's software GL, by default one per core. Call before any render.
 
     Args:
-        threads: Threads for the software GL, 0 for its own choice.
+        threads: Threads for the software GL, 0 for its default.
     """
     cv2.setNumThreads(1)
     if threads:

@@ -109,7 +109,7 @@ class _Panorama:
     """
 
     def __init__(self, path: str) -> None:
-        light = hdri.split(path).rest
+        light = hdri.split_light(path).residual
         height, width = light.shape[:2]
         self.image = bpy.data.images.new("panorama", width, height, alpha=False, float_buffer=True)
         self.image.colorspace_settings.name = "Linear Rec.709"

@@ -85,7 +85,7 @@ def _own_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None) -> bp
 
 
 def _pattern(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """The share of the accent colour: the formula of `pattern.share`."""
+    """The share of the accent colour: the formula of `pattern.accent_weight`."""
     place = tree.nodes.new("ShaderNodeTexCoord").outputs["Object"]
     band = tree.nodes.new("ShaderNodeSeparateXYZ")
     tree.links.new(_attribute(tree, BAND).outputs["Vector"], band.inputs["Vector"])
