@@ -1,4 +1,4 @@
-"""What the machine gives to this process: cores, memory, disk, shared memory."""
+"""Resources of the machine for this process: cores, memory, disk, shared memory."""
 
 import os
 import shutil
@@ -13,10 +13,10 @@ _SPARE_BYTES = 256 * 2**20  # left free on the disk
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """What may be used here.
+    """Available resources.
 
     Attributes:
-        cores: Cores that this process may run on.
+        cores: Number of cores for this process.
         cpu: Name of the processor.
         memory_bytes: Memory, or the container's limit where that is less.
         shared_bytes: Size of /dev/shm, 0 without one.
@@ -29,7 +29,7 @@ class Machine:
 
 
 def machine() -> Machine:
-    """Look at this machine."""
+    """Resources of this machine."""
     return Machine(
         cores=min(float(cores()), _cgroup_cores()),
         cpu=_cpu_name(),
@@ -39,7 +39,7 @@ def machine() -> Machine:
 
 
 def cores() -> int:
-    """Cores that this process may be scheduled on."""
+    """Number of cores that this process may be scheduled on."""
     return len(os.sched_getaffinity(0))
 
 
@@ -51,11 +51,11 @@ def memory_bytes() -> int:
 
 
 def free_bytes(path: Path) -> int:
-    """Free space where a folder is, or would be made."""
-    place = path.absolute()
-    while not place.exists():
-        place = place.parent
-    return shutil.disk_usage(place).free
+    """Free space on the disk of a folder, or of its nearest existing parent."""
+    folder = path.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
 
 
 def require_free_space(url: str, needed_bytes: int) -> None:
@@ -79,7 +79,7 @@ def require_free_space(url: str, needed_bytes: int) -> None:
 
 
 def _cgroup_cores() -> float:
-    """Cores' worth of time that the control group grants, infinite without a limit."""
+    """CPU quota of the control group in cores, infinite without a limit."""
     words = _text(_CGROUP / "cpu.max").split()
     if len(words) == 2 and words[0] != "max":
         return int(words[0]) / int(words[1])

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     metavar="SECONDS",
     help="Kill a worker that needs longer for a shard, and render the shard again. [20 x the median, at least 300]",
 )
-@click.option("--hypotheses-per-scene", type=click.IntRange(1), help="Pairs that share one rendered scene. [preset]")
+@click.option("--hypotheses-per-scene", type=click.IntRange(1), help="Pairs per rendered scene. [preset]")
 @click.option(
     "--hypothesis-engine",
     type=ENGINE,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     help="Device of cycles: auto is the first available one of optix, cuda and cpu. [preset, cpu]",
 )
 @click.option(
-    "--only", type=click.IntRange(0), metavar="I", help="Render sample I alone, and compare it with the stored one."
+    "--only", type=click.IntRange(0), metavar="I", help="Render sample I alone, and compare it with the stored sample."
 )
 @click.option(
     "--save",
@@ -66,8 +66,8 @@ def render(
 ) -> None:
     """Render N training pairs as a sharded Zarr dataset.
 
-    Stopping it at any moment, also with kill -9, loses only the shards in flight; the same command again continues
-    and ends with the same bytes. A scene that crashes the renderer twice is replaced by another draw, and reported.
+    A stop at any moment, even kill -9, loses only the shards in progress; the same command again continues and ends
+    with the same bytes. A scene that crashes the renderer twice is replaced by another draw, and reported.
 
     \b
     synthgen render --object mesh.ply --n 200000 --out shards

@@ -23,11 +23,11 @@ from synthgen.scene import Light, Material, Scene, Vector
 Array = np.ndarray
 
 _SUPERSAMPLING = 2
-_WHITE_KEY = -1_000_000_000  # a mesh's all-white twin, drawn where a material replaces its colours
+_WHITE_KEY = -1_000_000_000  # key of a mesh's white copy, drawn where a material replaces its colours
 
 
 class RasterEngine:
-    """Engine over `posecore.raster`: no shadows, no reflections, lamps taken as if they were at infinity."""
+    """Engine over `posecore.raster`: no shadows, no reflections, lamps as if at infinity."""
 
     name = "raster"
 
@@ -36,7 +36,7 @@ class RasterEngine:
         self._rasteriser: Rasteriser | None = None
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make meshes known under their keys."""
+        """Load meshes under their keys."""
         if self._rasteriser is None:
             self._rasteriser = Rasteriser({})
         for key, mesh in meshes.items():
@@ -46,7 +46,7 @@ class RasterEngine:
             self._rasteriser.add(_WHITE_KEY + key, replace(mesh, vertex_rgb=white, uv=None, texture_rgb=None))
 
     def render(self, scene: Scene) -> RenderedScene:
-        """Render `scene.region_px`: colour with 2 x 2 samples a pixel, depth and index at the pixel centres."""
+        """Render `scene.region_px`: colour with 2 x 2 samples per pixel, depth and index at the pixel centres."""
         if self._rasteriser is None:
             raise RenderError("the raster engine has no meshes; call load first")
         x0, y0, width, height = scene.region_px
@@ -71,7 +71,7 @@ class RasterEngine:
         )
 
     def close(self) -> None:
-        """Free what was uploaded."""
+        """Release GPU memory."""
         if self._rasteriser is not None:
             self._rasteriser.close()
             self._rasteriser = None
@@ -92,7 +92,7 @@ def _shading(scene: Scene) -> Shading:
 
 
 def _irradiance(light: Light, at_cam_m: Float[Array, "3"]) -> float:
-    """Irradiance in W/m^2 at a point that faces the lamp."""
+    """Irradiance of a surface that faces the lamp, W/m^2."""
     if light.kind == "sun":
         return light.strength
     d2 = float(np.sum((np.array(light.position_cam_m) - at_cam_m) ** 2))

@@ -117,7 +117,7 @@ def object_ids(paths: Sequence[str]) -> list[int]:
     if not paths or len(ids) < len(paths):
         ids = list(range(1, len(paths) + 1))
     if len(set(ids)) < len(ids):
-        raise ConfigError(f"--object: two files have the object id {max(ids, key=ids.count)}; rename one of them")
+        raise ConfigError(f"--object: two files have the object id {max(ids, key=ids.count)}; rename one file")
     return ids
 
 

@@ -40,7 +40,7 @@ class RunEstimate:
 
     @property
     def seconds_per_pair(self) -> float:
-        """Time of one pair."""
+        """Time per pair."""
         return self.seconds / self.pairs
 
     def size_bytes(self, n: int) -> int:
