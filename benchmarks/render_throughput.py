@@ -71,7 +71,7 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     watch.wrap(maker, "accepted_scene", "draw")
     watch.wrap(maker, "_hypotheses", "hypotheses")
     watch.wrap(maker._engines[config.engine], "render", "render")
-    watch.wrap(maker, "_shoot", "render, background, sensor")
+    watch.wrap(maker, "_render", "render, background, sensor")
     watch.wrap(maker, "_sample", "labels")
     began = time.perf_counter()
     done = [maker.samples(scene) for scene in range(scenes)]

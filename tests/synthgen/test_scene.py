@@ -31,11 +31,11 @@ def test_scene_survives_pickling():
 
 def test_pose_is_a_read_only_copy():
     T = np.eye(4)
-    thing = SceneObject(mesh_key=1, T_cam_obj=T)
+    item = SceneObject(mesh_key=1, T_cam_obj=T)
     T[0, 3] = 1.0
-    assert thing.T_cam_obj[0, 3] == 0.0
+    assert item.T_cam_obj[0, 3] == 0.0
     with pytest.raises(ValueError, match="read-only"):
-        thing.T_cam_obj[0, 3] = 1.0
+        item.T_cam_obj[0, 3] = 1.0
 
 
 def test_equal_numbers_make_equal_records():

@@ -52,7 +52,7 @@ def crowded(tmp_path_factory, config_of, meshes):
     return folder
 
 
-def test_it_reads_back_as_bop_with_poses_that_match_the_pictures(written, tug):
+def test_it_reads_back_as_bop_with_poses_that_match_the_images(written, tug):
     dataset = BopDataset(written)
     assert [(t.scene_id, t.im_id, t.obj_id, t.inst_count) for t in dataset.targets] == [(1, i, 1, 1) for i in range(3)]
     assert dataset.models_info[1].diameter_m == pytest.approx(tug.diameter_m, rel=1e-4)
@@ -60,11 +60,11 @@ def test_it_reads_back_as_bop_with_poses_that_match_the_pictures(written, tug):
         for im_id in range(3):
             camera = dataset.camera(1, im_id)
             assert dataset.rgb(1, im_id).shape == (480, 640, 3)
-            (truth,) = dataset.gt(1, im_id)
-            alone = rasteriser.render(1, camera.K, truth.T_cam_obj[None], 640, 480).depth_m[0]
+            (gt,) = dataset.gt(1, im_id)
+            alone = rasteriser.render(1, camera.K, gt.T_cam_obj[None], 640, 480).depth_m[0]
             depth = dataset.depth_m(1, im_id)
             same = (alone > 0) & (np.abs(depth - alone) < 2e-4)
-            assert truth.visib_fract == pytest.approx(same.sum() / (alone > 0).sum(), abs=0.02)
+            assert gt.visib_fract == pytest.approx(same.sum() / (alone > 0).sum(), abs=0.02)
 
 
 def test_it_reads_the_way_bop_toolkit_reads(crowded):
@@ -76,29 +76,29 @@ def test_it_reads_the_way_bop_toolkit_reads(crowded):
     assert set(models) == {"1", "4"}
     for about in models.values():
         assert {"diameter", "min_x", "min_y", "min_z", "size_x", "size_y", "size_z"} <= set(about)
-    cameras, truth, info = (
+    cameras, gts, info = (
         {int(k): v for k, v in json.loads((scene / f"scene_{name}.json").read_text()).items()}
         for name in ("camera", "gt", "gt_info")
     )
-    assert list(cameras) == list(truth) == list(info) == list(range(5))
-    for im_id in truth:
+    assert list(cameras) == list(gts) == list(info) == list(range(5))
+    for im_id in gts:
         K = np.array(cameras[im_id]["cam_K"]).reshape(3, 3)
         assert K[0, 1] == K[1, 0] == 0 and K[2, 2] == 1
         assert cameras[im_id]["depth_scale"] == 0.1
         rgb = cv2.imread(str(scene / f"rgb/{im_id:06d}.png"), cv2.IMREAD_UNCHANGED)
         depth = cv2.imread(str(scene / f"depth/{im_id:06d}.png"), cv2.IMREAD_UNCHANGED)
         assert (rgb.dtype, rgb.shape, depth.dtype, depth.shape) == (np.uint8, (120, 160, 3), np.uint16, (120, 160))
-        for gt_id, gt in enumerate(truth[im_id]):
+        for gt_id, gt in enumerate(gts[im_id]):
             R, t = np.array(gt["cam_R_m2c"]).reshape(3, 3), np.array(gt["cam_t_m2c"]).reshape(3, 1)
             assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) > 0 and t[2] > 100
             for kind in ("mask", "mask_visib"):
                 mask = cv2.imread(str(scene / f"{kind}/{im_id:06d}_{gt_id:06d}.png"), cv2.IMREAD_UNCHANGED)
                 assert (mask.dtype, mask.shape) == (np.uint8, (120, 160)) and set(np.unique(mask)) <= {0, 255}
-    assert len(list((scene / "mask").iterdir())) == sum(map(len, truth.values()))
+    assert len(list((scene / "mask").iterdir())) == sum(map(len, gts.values()))
     targets = json.loads((crowded / "test_targets_bop19.json").read_text())
     expected = {}
-    for im_id, gts in truth.items():
-        for gt, about in zip(gts, info[im_id], strict=True):
+    for im_id, poses in gts.items():
+        for gt, about in zip(poses, info[im_id], strict=True):
             if about["visib_fract"] >= 0.1:
                 expected[im_id, gt["obj_id"]] = expected.get((im_id, gt["obj_id"]), 0) + 1
     assert {(t["im_id"], t["obj_id"]): t["inst_count"] for t in targets} == expected
@@ -116,18 +116,18 @@ def test_visibility_is_that_of_a_render_of_all_objects(crowded):
         for im_id in dataset.im_ids(1):
             depth, K = dataset.depth_m(1, im_id), dataset.camera(1, im_id).K.copy()
             K[:2, 2] += (160, 120)
-            for truth in dataset.gt(1, im_id):
-                wide = rasteriser.render(truth.obj_id, K, truth.T_cam_obj[None], 480, 360, rgb=False).depth_m[0]
+            for gt in dataset.gt(1, im_id):
+                wide = rasteriser.render(gt.obj_id, K, gt.T_cam_obj[None], 480, 360, rgb=False).depth_m[0]
                 inside = wide[120:240, 160:320]
                 masks = [
-                    cv2.imread(str(crowded / f"test/000001/{kind}/{im_id:06d}_{truth.gt_index:06d}.png"), -1) > 0
+                    cv2.imread(str(crowded / f"test/000001/{kind}/{im_id:06d}_{gt.gt_index:06d}.png"), -1) > 0
                     for kind in ("mask", "mask_visib")
                 ]
                 assert np.array_equal(masks[0], inside > 0)
                 seen = (inside > 0) & (np.abs(depth - inside) < 2e-4)
                 assert (masks[1] ^ seen).sum() <= 2
                 assert (masks[1] <= masks[0]).all()
-                about = info[str(im_id)][truth.gt_index]
+                about = info[str(im_id)][gt.gt_index]
                 assert about["px_count_all"] == (wide > 0).sum()
                 assert about["px_count_valid"] == ((inside > 0) & (depth > 0)).sum()
                 assert about["px_count_visib"] == masks[1].sum()
@@ -317,9 +317,9 @@ def test_cycles_frames_match_the_rasteriser_and_do_not_depend_on_workers(tmp_pat
     with Rasteriser({i: dataset.mesh(i) for i in meshes}) as rasteriser:
         for scene_id, im_id in ((0, 0), (0, 1), (1, 0), (1, 1)):
             depth, K = dataset.depth_m(scene_id, im_id), dataset.camera(scene_id, im_id).K
-            for truth in dataset.gt(scene_id, im_id):
-                alone = rasteriser.render(truth.obj_id, K, truth.T_cam_obj[None], 160, 120, rgb=False).depth_m[0]
-                file = tmp_path / f"a/test/{scene_id:06d}/mask_visib/{im_id:06d}_{truth.gt_index:06d}.png"
+            for gt in dataset.gt(scene_id, im_id):
+                alone = rasteriser.render(gt.obj_id, K, gt.T_cam_obj[None], 160, 120, rgb=False).depth_m[0]
+                file = tmp_path / f"a/test/{scene_id:06d}/mask_visib/{im_id:06d}_{gt.gt_index:06d}.png"
                 visible = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) > 0
                 expected = (alone > 0) & (np.abs(depth - alone) < 2e-3)
                 seen, wrong = seen + expected.sum(), wrong + (expected ^ visible).sum()

@@ -84,14 +84,14 @@ def test_one_object_is_a_pairs_scene(layouts):
         assert (layout.others, layout.lights, layout.background) == (base.others, base.lights, base.background)
 
 
-def test_cameras_look_at_an_object_from_its_distances(layouts):
+def test_cameras_are_aimed_at_an_object_from_its_distances(layouts):
     config, targets, made = layouts("scene.kind=tabletop", "tabletop.elevation_deg=[30, 50]", together=True)
     camera, rng = config.camera.camera(), np.random.default_rng(0)
     for _, layout in made:
         number, T = draw_camera(rng, config, targets, layout)
-        seen = layout.labelled[number]
-        target = targets[seen.mesh_key]
-        centre = se3.apply(T @ seen.T_cam_obj, target.mesh.center_m[None])
+        aim = layout.labelled[number]
+        target = targets[aim.mesh_key]
+        centre = se3.apply(T @ aim.T_cam_obj, target.mesh.center_m[None])
         assert target.distance_m[0] <= centre[0, 2] <= target.distance_m[1]
         u, v = project(camera.K, centre)[0]
         assert abs(u - 320) <= 0.6 * 320 + 1e-6 and abs(v - 240) <= 0.6 * 240 + 1e-6
@@ -100,7 +100,7 @@ def test_cameras_look_at_an_object_from_its_distances(layouts):
         assert -math.sin(math.radians(50)) - 1e-9 <= down[2] <= -math.sin(math.radians(30)) + 1e-9
 
 
-def test_a_level_camera_sees_up_upwards():
+def test_a_level_camera_has_up_at_the_top_of_the_image():
     R = level_rotation(math.radians(40), 1.0, 0.0)
     up = R @ np.array([0.0, 0.0, 1.0])
     assert up[1] < 0 and abs(up[0]) < 1e-12
@@ -117,12 +117,12 @@ def test_the_ceiling_lamp_hangs_over_the_table(layouts):
     above = se3.apply(se3.inverse(T), np.array([area.position_cam_m, point.position_cam_m]))
     assert np.allclose(above[0, :2], 0, atol=1e-9) and above[0, 2] > above[1, 2] > 0
     assert area.kind == "area" and point.kind == "point"
-    share = np.pi * ambient[0] + area.strength / (np.pi * above[0, 2] ** 2)
-    share += point.strength / (4 * np.pi * np.sum(above[1] ** 2))
-    assert np.pi * 0.5 <= share <= np.pi * 1.6
+    irradiance = np.pi * ambient[0] + area.strength / (np.pi * above[0, 2] ** 2)
+    irradiance += point.strength / (4 * np.pi * np.sum(above[1] ** 2))
+    assert np.pi * 0.5 <= irradiance <= np.pi * 1.6
 
 
-def test_clearance_is_to_the_nearest_ball(layouts):
+def test_clearance_is_to_the_nearest_sphere(layouts):
     _, targets, made = layouts(count=1)
     layout = made[0][1]
     spheres = BoundingSpheres({i: t.mesh for i, t in targets.items()})

@@ -27,10 +27,10 @@ def test_waves_keep_their_bounds():
     assert still(0.0) == still(9.0)
 
 
-def test_turns_keep_their_speed():
+def test_rotations_keep_their_speed():
     for seed in range(5):
-        turn = draw_rotation(np.random.default_rng(seed), np.pi, 1.2, 2.0)
-        R = np.stack([turn(i / 100) for i in range(800)])
+        rotation = draw_rotation(np.random.default_rng(seed), np.pi, 1.2, 2.0)
+        R = np.stack([rotation(i / 100) for i in range(800)])
         step = se3.rotation_angle_rad(R[1:] @ R[:-1].swapaxes(-1, -2))
         assert step.max() * 100 <= 1.2 + 1e-6
 
@@ -50,8 +50,8 @@ def test_nothing_jumps(filmed):
     dt, diameter = 1 / config.sequence.fps, target.mesh.diameter_m
     for number in range(len(views[0].layout.labelled)):
         T = np.stack([v.T_cam_ref @ v.layout.labelled[number].T_cam_obj for v in views])
-        turn = np.degrees(se3.rotation_angle_rad(T[1:, :3, :3] @ T[:-1, :3, :3].swapaxes(-1, -2))) / dt
-        assert turn.max() <= config.sequence.max_angular_speed_deg_s + 1e-6
+        speed_deg_s = np.degrees(se3.rotation_angle_rad(T[1:, :3, :3] @ T[:-1, :3, :3].swapaxes(-1, -2))) / dt
+        assert speed_deg_s.max() <= config.sequence.max_angular_speed_deg_s + 1e-6
         centre = se3.apply(T, target.mesh.center_m[None])[:, 0]
         velocity = np.diff(centre, axis=0) / dt
         acceleration = np.diff(velocity, axis=0) / dt
@@ -74,7 +74,7 @@ def test_the_first_object_stays_in_the_image_at_its_distances(filmed):
         assert (uv >= 0).all() and (uv <= [camera.width_px, camera.height_px]).all()
 
 
-def test_nothing_touches_and_a_shape_passes_before_the_object(filmed):
+def test_nothing_touches_and_an_occluder_passes_in_front_of_the_object(filmed):
     config, target, views = filmed
     meshes = {1: target.mesh, **target.shapes, **target.tables}
     spheres, camera = BoundingSpheres(meshes), config.camera.camera()
@@ -82,12 +82,12 @@ def test_nothing_touches_and_a_shape_passes_before_the_object(filmed):
     before = 0
     for view in views:
         layout = view.layout
-        things = [o for o in (*layout.labelled, *layout.others) if o.mesh_key not in target.tables]
+        items = [o for o in (*layout.labelled, *layout.others) if o.mesh_key not in target.tables]
         passing = layout.others[still:] if len(layout.others) > still else ()
         if layout.on_table:
-            things = [*layout.labelled[:1], *passing]  # what lies there keeps apart seen from above: see test_frames
-        for i, a in enumerate(things):
-            for b in things[:i]:
+            items = [*layout.labelled[:1], *passing]  # what lies there keeps apart seen from above: see test_frames
+        for i, a in enumerate(items):
+            for b in items[:i]:
                 (c, r), (d, s) = spheres.sphere(a), spheres.sphere(b)
                 assert np.linalg.norm(c - d) >= r + s - 1e-9
         for shape in passing:
@@ -95,12 +95,12 @@ def test_nothing_touches_and_a_shape_passes_before_the_object(filmed):
                 view.T_cam_ref[:3, :3] @ spheres.sphere(o)[0] + view.T_cam_ref[:3, 3]
                 for o in (shape, layout.labelled[0])
             ]
-            apart = np.linalg.norm(np.diff(project(camera.K, np.stack(ends)), axis=0))
-            before += apart < 60 and ends[0][2] < ends[1][2]
+            distance_px = np.linalg.norm(np.diff(project(camera.K, np.stack(ends)), axis=0))
+            before += distance_px < 60 and ends[0][2] < ends[1][2]
     assert before >= 2
 
 
-def test_looks_are_those_of_the_sequence_and_light_swings(filmed):
+def test_materials_are_those_of_the_sequence_and_light_varies(filmed):
     config, _, views = filmed
     first = views[0]
     for view in views[1:]:

@@ -15,12 +15,12 @@ def test_shapes_have_the_asked_sizes_and_repeat():
     shapes = occluders.primitive_shapes(config, seed=3, obj_id=1, diameter_m=0.2)
     again = occluders.primitive_shapes(config, seed=3, obj_id=1, diameter_m=0.2)
     assert len(shapes) == 12
-    for shape, twin in zip(shapes, again, strict=True):
+    for shape, repeated in zip(shapes, again, strict=True):
         assert 0.1 - 1e-9 <= shape.diameter_m <= 0.16 + 1e-9
         np.testing.assert_allclose(shape.center_m, 0, atol=1e-9)
         np.testing.assert_allclose(np.linalg.norm(shape.normals, axis=1), 1, atol=1e-3)
-        assert np.array_equal(shape.vertices_m, twin.vertices_m)
-        assert np.array_equal(shape.vertex_rgb, twin.vertex_rgb)
+        assert np.array_equal(shape.vertices_m, repeated.vertices_m)
+        assert np.array_equal(shape.vertex_rgb, repeated.vertex_rgb)
     other = occluders.primitive_shapes(config, seed=4, obj_id=1, diameter_m=0.2)
     assert any(a.diameter_m != b.diameter_m for a, b in zip(shapes, other, strict=True))
 
@@ -61,7 +61,7 @@ def test_front_shapes_hide_part_of_the_object_but_not_too_much(maker_of):
     assert (visible < 0.95).mean() > 0.3
 
 
-def test_a_wanted_visible_share_is_met(maker_of):
+def test_the_visible_fraction_is_reached(maker_of):
     maker = maker_of(
         "occluders.visible_fraction=[0.3, 0.9]",
         "occluders.min_visible=0.2",
@@ -69,18 +69,18 @@ def test_a_wanted_visible_share_is_met(maker_of):
         "occluders.props=[0, 0]",
         "view.position_jitter=0.2",
     )
-    seen, wanted = [], []
+    visible, goals = [], []
     for i in range(60):
         draw, attempt = maker.accepted_scene(i)
-        wanted.append(stream(0, Purpose.PAIRS, Subject.VISIBILITY, i, attempt).uniform(0.3, 0.9))
-        seen.append(maker._visible_fraction(target_box(draw.target, maker.camera, draw.T_cam_obj), draw))
-    off = np.abs(np.array(seen) - wanted)
-    assert np.mean(off <= 0.03) > 0.8  # a thin ring in front may jump over the wanted share
-    counts, _ = np.histogram(seen, bins=4, range=(0.28, 0.92))
+        goals.append(stream(0, Purpose.PAIRS, Subject.VISIBILITY, i, attempt).uniform(0.3, 0.9))
+        visible.append(maker._visible_fraction(target_box(draw.target, maker.camera, draw.T_cam_obj), draw))
+    off = np.abs(np.array(visible) - goals)
+    assert np.mean(off <= 0.03) > 0.8  # a thin ring in front may skip the drawn fraction
+    counts, _ = np.histogram(visible, bins=4, range=(0.28, 0.92))
     assert counts.min() >= 5
 
 
-def test_without_front_shapes_nothing_is_slid_in(maker_of):
+def test_without_front_shapes_nothing_is_moved_in(maker_of):
     maker = maker_of("occluders.visible_fraction=[0.4, 0.5]", "occluders.front=[0, 0]", "occluders.props=[0, 0]")
     assert maker.accepted_scene(0)[0].front == ()
 
@@ -93,17 +93,17 @@ def test_meshes_are_scaled_to_the_object_or_left_alone(tug, config_of):
     for shape, original in zip(target.shapes.values(), clutter, strict=True):
         assert 0.4 <= shape.diameter_m / tug.diameter_m <= 0.6
         assert np.ptp(shape.vertices_m / original.vertices_m) < 1e-9
-    own = make_target(7, tug, config_of("occluders.scale=own"), Assets(occluders=clutter))
-    assert [s.diameter_m for s in own.shapes.values()] == [s.diameter_m for s in clutter]
+    unscaled = make_target(7, tug, config_of("occluders.scale=own"), Assets(occluders=clutter))
+    assert [s.diameter_m for s in unscaled.shapes.values()] == [s.diameter_m for s in clutter]
     rng = np.random.default_rng(0)
     many = OccluderConfig(front=(20, 20), props=(20, 20))
-    front, props = occluders.draw_occluders(rng, many, own.shapes, np.array([0.0, 0.0, 1.0]), tug.diameter_m)
-    assert {own.shapes[o.mesh_key].diameter_m for o in (*front, *props)} == {
+    front, props = occluders.draw_occluders(rng, many, unscaled.shapes, np.array([0.0, 0.0, 1.0]), tug.diameter_m)
+    assert {unscaled.shapes[o.mesh_key].diameter_m for o in (*front, *props)} == {
         clutter[0].diameter_m,
         clutter[1].diameter_m,
     }
 
 
-def test_a_wanted_share_below_what_is_accepted_is_refused():
+def test_a_visible_fraction_below_the_smallest_accepted_is_refused():
     with pytest.raises(ConfigError, match=r"visible_fraction starts at 0\.2, expected at least min_visible"):
         OccluderConfig(visible_fraction=(0.2, 1.0), min_visible=0.4)

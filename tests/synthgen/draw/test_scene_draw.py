@@ -134,17 +134,17 @@ def test_materials_have_their_fractions(config_of, tug_target):
     config = config_of(
         "material.textureless_fraction=0.3", "material.random_colour_fraction=0.4", "material.hue_shift=0"
     )
-    looks = [draw(config, tug_target, i).material for i in range(200)]
-    own = [m for m in looks if m.base_rgb is None]
-    patterned = [m for m in looks if m.pattern is not None]
-    assert len(own) / 200 == pytest.approx(0.3, abs=0.09)
+    materials = [draw(config, tug_target, i).material for i in range(200)]
+    unchanged = [m for m in materials if m.base_rgb is None]
+    patterned = [m for m in materials if m.pattern is not None]
+    assert len(unchanged) / 200 == pytest.approx(0.3, abs=0.09)
     assert len(patterned) / 200 == pytest.approx(0.2, abs=0.08)
     rng = np.random.default_rng(0)
     mean = replace(
         config.material, textureless_fraction=1.0, random_colour_fraction=0.0, saturation=(1, 1), value=(1, 1)
     )
     np.testing.assert_allclose(appearance.draw_material(rng, mean, tug_target).base_rgb, tug_target.mean_rgb, atol=1e-6)
-    assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in looks if m.base_rgb is not None)
+    assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in materials if m.base_rgb is not None)
 
 
 def test_panoramas_light_and_show_in_their_fractions_and_stand_upright(config_of, tug_target):

@@ -25,12 +25,12 @@ def draws(config, target, count=40):
     return [scene_draw.draw_scene(config, [target], Assets(), Purpose.PAIRS, i, 0) for i in range(count)]
 
 
-def on_table(draw, thing):
-    """A thing's vertices in the table's frame."""
+def on_table(draw, item):
+    """An object's vertices in the table's frame."""
     table, *_ = draw.around
     meshes = {**draw.target.shapes, draw.target.obj_id: draw.target.mesh}
-    T = inverse(table.T_cam_obj) @ (draw.T_cam_obj if thing is None else thing.T_cam_obj)
-    return apply(T, meshes[draw.target.obj_id if thing is None else thing.mesh_key].vertices_m)
+    T = inverse(table.T_cam_obj) @ (draw.T_cam_obj if item is None else item.T_cam_obj)
+    return apply(T, meshes[draw.target.obj_id if item is None else item.mesh_key].vertices_m)
 
 
 @pytest.fixture(scope="module")
@@ -41,8 +41,8 @@ def target(tug, config_of):
 def test_objects_lie_on_the_table_and_touch_it(config_of, target):
     for draw in draws(config_of(*TABLETOP, "tabletop.near_fraction=0"), target):
         half = target.tables[draw.around[0].mesh_key].vertices_m.max(axis=0)
-        for thing in (None, *draw.around[1:]):
-            points = on_table(draw, thing)
+        for item in (None, *draw.around[1:]):
+            points = on_table(draw, item)
             assert points[:, 2].min() == pytest.approx(0.0, abs=1e-6)
             middle = (points.min(axis=0) + points.max(axis=0)) / 2
             assert (np.abs(middle[:2]) <= half[:2]).all()
@@ -53,8 +53,8 @@ def test_nothing_on_the_table_stands_in_something_else(config_of, target):
     count = 0
     for draw in draws(config_of(*TABLETOP), target):
         circles = []
-        for thing in (None, *draw.around[1:]):
-            points = on_table(draw, thing)[:, :2]
+        for item in (None, *draw.around[1:]):
+            points = on_table(draw, item)[:, :2]
             middle = (points.min(axis=0) + points.max(axis=0)) / 2
             circles.append((middle, np.linalg.norm(points - middle, axis=1).max()))
         for i, (a, r) in enumerate(circles):
@@ -88,7 +88,7 @@ def test_upright_objects_stand(config_of, target):
         np.testing.assert_allclose(T_table_obj[:3, 2], [0, 0, 1], atol=1e-9)
 
 
-def test_mixed_scenes_have_their_share_and_keep_their_kind_when_drawn_again(config_of, target):
+def test_mixed_scenes_have_their_fraction_and_keep_their_kind_when_drawn_again(config_of, target):
     config = config_of(
         *TABLETOP,
         "scene.kind=mixed",
@@ -111,8 +111,8 @@ def test_front_occluders_float_above_the_table(config_of, target):
     lying = 0
     for draw in draws(config, target, 20):
         assert len(draw.front) == 3
-        for thing in draw.front:
-            lowest = on_table(draw, thing)[:, 2].min()
+        for item in draw.front:
+            lowest = on_table(draw, item)[:, 2].min()
             assert lowest > -1e-9
             lying += int(lowest < 1e-6)
     assert lying, "none had to be lifted"

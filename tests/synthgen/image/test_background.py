@@ -5,7 +5,7 @@ from synthgen.image import background
 from synthgen.scene import Background
 
 
-def test_a_seed_gives_the_same_picture_and_another_seed_another():
+def test_a_seed_gives_the_same_image_and_another_seed_another():
     a, b = (background.draw(Background(seed=5), 90, 60) for _ in range(2))
     assert a.shape == (60, 90, 3)
     assert a.dtype == np.uint8
@@ -14,9 +14,9 @@ def test_a_seed_gives_the_same_picture_and_another_seed_another():
 
 
 def test_drawn_backgrounds_differ_in_colour_and_texture():
-    pictures = np.stack([background.draw(Background(seed=s), 48, 48) for s in range(60)]).astype(float)
-    means = pictures.mean(axis=(1, 2))
-    texture = np.abs(np.diff(pictures, axis=2)).mean(axis=(1, 2, 3))
+    images = np.stack([background.draw(Background(seed=s), 48, 48) for s in range(60)]).astype(float)
+    means = images.mean(axis=(1, 2))
+    texture = np.abs(np.diff(images, axis=2)).mean(axis=(1, 2, 3))
     assert means.std(axis=0).min() > 20
     assert texture.min() < 3
     assert texture.max() > 15

@@ -33,7 +33,7 @@ def direction_of(column, row, size_px=(128, 64)):
     return np.append(flat, np.sin(elevation))
 
 
-def looking_at(direction_env, towards_cam):
+def rotation_to(direction_env, towards_cam):
     """A rotation R_cam_env that turns a direction of the panorama to one of the camera."""
     a, b = (np.asarray(v) / np.linalg.norm(v) for v in (direction_env, towards_cam))
     axis = np.cross(a, b)
@@ -61,15 +61,15 @@ def brightest(image):
     return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum() - half
 
 
-@pytest.mark.parametrize("place", [(100, 20), (10, 40), (64, 31)])
-def test_the_spot_is_seen_where_the_turn_puts_it(tmp_path, place):
-    path = write_hdr(tmp_path / "spot.hdr", *place)
+@pytest.mark.parametrize("position", [(100, 20), (10, 40), (64, 31)])
+def test_the_spot_is_visible_where_the_rotation_puts_it(tmp_path, position):
+    path = write_hdr(tmp_path / "spot.hdr", *position)
     for x, y in ((0.0, 0.0), (0.8, 0.1), (-0.3, 0.6)):
-        turn = looking_at(direction_of(*place), (x, y, 1.0))
-        seen = hdri.crop(Environment(path=path, R_cam_env=turn, strength=0.1), WIDE.K, (0, 0, 64, 64))
-        np.testing.assert_allclose(brightest(seen), [20 * x, 20 * y], atol=1.2)
-        v, u = np.unravel_index(seen.sum(axis=2).argmax(), (64, 64))
-        assert seen[v, u, 0] >= seen[v, u, 2]  # red above blue
+        R = rotation_to(direction_of(*position), (x, y, 1.0))
+        view = hdri.crop(Environment(path=path, R_cam_env=R, strength=0.1), WIDE.K, (0, 0, 64, 64))
+        np.testing.assert_allclose(brightest(view), [20 * x, 20 * y], atol=1.2)
+        v, u = np.unravel_index(view.sum(axis=2).argmax(), (64, 64))
+        assert view[v, u, 0] >= view[v, u, 2]  # red above blue
 
 
 def test_upright_panoramas_are_not_mirrored(tmp_path):
@@ -92,11 +92,11 @@ def test_a_crop_goes_on_across_the_seam_and_regions_are_cuts(tmp_path):
     assert np.array_equal(hdri.crop(environment, WIDE.K, (10, 20, 30, 9)), whole[20:29, 10:40])
 
 
-def test_lamps_in_its_place_have_its_direction_colour_and_power(tmp_path):
+def test_lamps_instead_of_a_panorama_have_its_direction_colour_and_power(tmp_path):
     path = write_hdr(tmp_path / "spot.hdr", 40, 20)
     R = random_rotation(np.random.default_rng(1))
-    thing = SceneObject(mesh_key=1, T_cam_obj=at(0, 0, 0.5))
-    scene = scene_of(thing, environment=Environment(path=path, R_cam_env=R, strength=2.0), ambient_rgb=(0, 0, 0))
+    item = SceneObject(mesh_key=1, T_cam_obj=at(0, 0, 0.5))
+    scene = scene_of(item, environment=Environment(path=path, R_cam_env=R, strength=2.0), ambient_rgb=(0, 0, 0))
     lit = hdri.with_lamps(scene)
     (sun,) = lit.lights
     assert np.dot(sun.direction_cam, R @ direction_of(40, 20)) > math.cos(math.radians(3))
@@ -112,12 +112,12 @@ def test_lamps_in_its_place_have_its_direction_colour_and_power(tmp_path):
     assert hdri.with_lamps(replace(scene, environment=None)).lights == ()
 
 
-def test_unit_level_lights_a_white_world_like_even_light(tmp_path):
+def test_unit_level_lights_a_white_world_like_ambient_light(tmp_path):
     cv2.imwrite(str(tmp_path / "white.hdr"), np.full((16, 32, 3), 7.0, np.float32))
     np.testing.assert_allclose(hdri.load(str(tmp_path / "white.hdr")).light, 1.0, atol=0.01)
 
 
-def test_suns_and_what_is_left_light_every_side_as_the_panorama_does(tmp_path):
+def test_suns_and_residual_light_every_side_as_the_panorama_does(tmp_path):
     """Irradiance on the six sides of a cube, against the whole panorama's, with more lamps in it than suns."""
     rng = np.random.default_rng(3)
     image = np.full((128, 256, 3), 0.1, np.float32)
@@ -145,9 +145,9 @@ def test_exr_is_read_like_hdr(tmp_path):
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, {"RGB": rgb}) as file:
         file.write(str(tmp_path / "spot.exr"))
-    found = hdri.list_hdris(tmp_path)
-    assert [p.rsplit(".", 1)[1] for p in found] == ["exr", "hdr"]
-    np.testing.assert_allclose(hdri.load(found[0]).light, hdri.load(found[1]).light, rtol=1e-5)
+    panoramas = hdri.list_hdris(tmp_path)
+    assert [p.rsplit(".", 1)[1] for p in panoramas] == ["exr", "hdr"]
+    np.testing.assert_allclose(hdri.load(panoramas[0]).light, hdri.load(panoramas[1]).light, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["broken.hdr", "broken.exr"])
@@ -170,11 +170,11 @@ def test_folders_without_panoramas_and_wrong_shapes_are_named(tmp_path):
 
 def sides_of(engine, path, towards_cam, samples=8):
     """Where the light on a ball comes from, and where the background shows the lamp, from the middle in px."""
-    turn = looking_at(direction_of(40, 20), towards_cam)
+    R = rotation_to(direction_of(40, 20), towards_cam)
     scene = scene_of(
         SceneObject(mesh_key=1, T_cam_obj=at(0, 0, 0.5), material=MATT),
         camera=WIDE,
-        environment=Environment(path=path, R_cam_env=turn),
+        environment=Environment(path=path, R_cam_env=R),
         ambient_rgb=(0.0, 0.0, 0.0),
         background=Background(kind="environment"),
         samples=samples,
@@ -218,11 +218,11 @@ def test_light_and_background_agree_in_cycles(tmp_path):
     assert sides_of(engine, path, (0.3, 0.2, -1.0), 2)[0].tolist() == first  # decoded and uploaded again
     lamps = scene_of(SceneObject(mesh_key=1, T_cam_obj=at(0, 0, 0.5)), samples=2)
     lit = replace(lamps, environment=Environment(path=path, R_cam_env=np.eye(3)), ambient_rgb=(0.0, 0.0, 0.0))
-    pictures = [engine.render(scene).rgb_linear.tobytes() for scene in (lamps, lit, lamps, lit)]
-    assert pictures[:2] == pictures[2:]
+    renders = [engine.render(scene).rgb_linear.tobytes() for scene in (lamps, lit, lamps, lit)]
+    assert renders[:2] == renders[2:]
     fresh = make_engine("cycles", threads=1)
     fresh.load({1: ball()})
-    assert [fresh.render(scene).rgb_linear.tobytes() for scene in (lit, lamps)] == pictures[1::-1]
+    assert [fresh.render(scene).rgb_linear.tobytes() for scene in (lit, lamps)] == renders[1::-1]
     fresh.close()
     engine.close()
     assert [len(x) for x in (bpy.data.worlds, bpy.data.images)] == before

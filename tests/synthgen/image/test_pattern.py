@@ -14,11 +14,11 @@ LOOK = Material(base_rgb=(1.0, 0.5, 0.0), pattern=PATTERN, roughness=1.0, specul
 def test_bands_repeat_along_the_wave_and_keep_their_bounds():
     straight = Pattern(accent_rgb=(1.0, 1.0, 1.0), wave=(2 * np.pi * 10, 0.0, 0.0), sharpness=8.0)
     x = np.linspace(0, 1, 1000, endpoint=False) + 5e-4
-    share = pattern.accent_weight(straight, np.stack([x, 0.3 + 0 * x, 7.0 * x], axis=1))
-    assert (share.min(), share.max()) == (0.0, 1.0)
-    assert share.mean() == pytest.approx(0.5, abs=0.01)
-    np.testing.assert_allclose(share[:100], share[300:400], atol=1e-9)
-    assert (np.diff(share > 0.5) != 0).sum() == 19
+    weight = pattern.accent_weight(straight, np.stack([x, 0.3 + 0 * x, 7.0 * x], axis=1))
+    assert (weight.min(), weight.max()) == (0.0, 1.0)
+    assert weight.mean() == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_allclose(weight[:100], weight[300:400], atol=1e-9)
+    assert (np.diff(weight > 0.5) != 0).sum() == 19
 
 
 @pytest.mark.parametrize("name", ["raster", pytest.param("cycles", marks=pytest.mark.blender)])
@@ -34,9 +34,9 @@ def test_both_engines_show_the_formula(name):
     v, u = np.nonzero(inside & (layers.index == 0))
     p_cam = back_project(scene.camera.K, np.stack([u, v], -1) + 0.5, layers.depth_m[v, u])
     p_obj = (p_cam - T[:3, 3]) @ T[:3, :3]
-    share = pattern.accent_weight(PATTERN, p_obj)[:, None]
+    weight = pattern.accent_weight(PATTERN, p_obj)[:, None]
     base = linear_from_display(np.array([[[255, 128, 0]]], np.uint8))[0]
-    expected = base * (1 - share) + np.array([0.0, 0.0, 1.0]) * share
+    expected = base * (1 - weight) + np.array([0.0, 0.0, 1.0]) * weight
     difference = np.abs(layers.rgb_linear[v, u] - expected)
     assert np.quantile(difference, 0.9) < 0.12  # a pixel of the picture is an average, the formula a point
     assert difference.mean() < 0.05
@@ -48,7 +48,7 @@ def test_a_patterned_thing_that_is_hidden_wholly_changes_nothing():
     engine.load({1: quad()})
     front = SceneObject(mesh_key=1, T_cam_obj=at(0.0, 0.0, 0.5), material=Material(base_rgb=(0.2, 0.5, 0.1)))
     behind = SceneObject(mesh_key=1, T_cam_obj=at(0.0, 0.0, 0.6), material=LOOK)
-    alone, both = (engine.render(scene_of(*things, samples=4)) for things in ((front,), (front, behind)))
+    alone, both = (engine.render(scene_of(*items, samples=4)) for items in ((front,), (front, behind)))
     engine.close()
     assert (alone.index == 0).any()
     np.testing.assert_array_equal(both.index, alone.index)

@@ -181,21 +181,22 @@ def test_without_visible_masks_the_annotated_objects_hide_one_another(tug, confi
 def test_hypotheses_of_a_result_file_belong_to_the_nearest_instance(images, tmp_path):
     rng = np.random.default_rng(0)
     there = poses(images)
-    guesses = [se3.perturb(gt.T_cam_obj, 0.1, 0.004, rng) for *_, gt in there]
-    rows = [estimate(s, i, gt.obj_id, T) for (s, i, gt), T in zip(there, guesses, strict=True)]
+    hypotheses = [se3.perturb(gt.T_cam_obj, 0.1, 0.004, rng) for *_, gt in there]
+    rows = [estimate(s, i, gt.obj_id, T) for (s, i, gt), T in zip(there, hypotheses, strict=True)]
     write_results(tmp_path / "guesses.csv", rows)
     planned = cut_to(tmp_path / "shards", images, CutConfig(**SMALL), tmp_path / "guesses.csv")
     values = samples(tmp_path / "shards")
     assert planned.n == len(values["obj_id"]) == len(there)
     assert len({(s, i, gt.obj_id) for s, i, gt in there}) < len(there)  # some are there twice
-    for T, guess in zip(values["T_cam_obj"], values["T_cam_obj_hypothesis"], strict=True):
-        which = min(range(len(guesses)), key=lambda k, guess=guess: np.abs(guesses[k] - guess).max())
-        assert guesses[which] == pytest.approx(guess, abs=1e-6)
+    for T, hypothesis in zip(values["T_cam_obj"], values["T_cam_obj_hypothesis"], strict=True):
+        distances = [np.abs(other - hypothesis).max() for other in hypotheses]
+        which = int(np.argmin(distances))
+        assert hypotheses[which] == pytest.approx(hypothesis, abs=1e-6)
         assert there[which][2].T_cam_obj == pytest.approx(T, abs=1e-6)
 
 
 def test_a_hypothesis_of_a_pose_that_is_left_out_is_not_another_ones(images, tmp_path):
-    """Of two instances one is hidden: what was found there is not a bad guess at the other."""
+    """Of two instances one is hidden: what was found there is not a bad hypothesis at the other."""
     there = poses(images)
     (s, i, hidden), rest = next(
         ((s, i, gt), others)
@@ -281,7 +282,7 @@ def test_hidden_rims_are_hidden_and_thin_differences_are_not():
     assert not cut._hidden(disc, smaller).any()
 
 
-def test_what_is_seen_beyond_the_mesh_stays_foreground(images, own, tmp_path):
+def test_what_is_visible_beyond_the_mesh_stays_foreground(images, own, tmp_path):
     """The object is a little larger than its mesh: exchanging what is behind must not cut it at the label's edge."""
     for file in own.split_path.rglob("mask_visib/*.png"):
         mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
@@ -299,8 +300,8 @@ def test_a_source_that_changed_is_another_one(images, own, tmp_path):
     planned = cut_plan.plan(images, CutConfig(**SMALL))
     same = cut_plan.plan(own, CutConfig(**SMALL))
     assert planned.digest == same.digest
-    picture = next(own.split_path.rglob("rgb/000001.png"))
-    cv2.imwrite(str(picture), cv2.GaussianBlur(cv2.imread(str(picture)), (0, 0), 2.0))
+    file = next(own.split_path.rglob("rgb/000001.png"))
+    cv2.imwrite(str(file), cv2.GaussianBlur(cv2.imread(str(file)), (0, 0), 2.0))
     assert cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL)).digest != planned.digest
 
 
@@ -331,8 +332,8 @@ def test_two_cuts_of_the_same_images_are_merged_into_the_same_scenes(images, tmp
     reader = ShardReader(str(tmp_path / "both"))
     rows = [reader.read(i, ["scene_index", "T_cam_obj"]) for i in reader.committed]
     scenes_of: dict[bytes, set[int]] = {}
-    for one in rows:
-        for T, scene in zip(one["T_cam_obj"], one["scene_index"], strict=True):
+    for row in rows:
+        for T, scene in zip(row["T_cam_obj"], row["scene_index"], strict=True):
             scenes_of.setdefault(T.tobytes(), set()).add(int(scene))
     assert len(scenes_of) > 3
     assert all(len(scenes) == 1 for scenes in scenes_of.values())
@@ -401,8 +402,8 @@ def test_wrong_inputs_are_one_line_each(images, own, tmp_path):
     with pytest.raises(DatasetError, match=r"mask_visib.000001_000001\.png: is 90 x 100 pixels, expected 320 x 240"):
         cut_to(tmp_path / "sizes", BopDataset(own.root), CutConfig(**SMALL))
     mask.write_bytes(whole)
-    picture = next(own.split_path.rglob("rgb/000001.png"))
-    cv2.imwrite(str(picture), np.zeros((100, 90, 3), np.uint8))
+    file = next(own.split_path.rglob("rgb/000001.png"))
+    cv2.imwrite(str(file), np.zeros((100, 90, 3), np.uint8))
     with pytest.raises(DatasetError, match=r"320 x 240 pixels and image 1 of scene 1 90 x 100, expected images of one"):
         cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL))
     for file in own.split_path.rglob("scene_gt.json"):

@@ -59,14 +59,14 @@ def test_the_window_is_fixed_and_centred_on_the_hypothesis(maker_of, tug_target)
         assert side == pytest.approx(maker.targets[0].window_side_px)
         box = silhouette_box(tug_target.mesh.vertices_m, s["K"][i], s["T_cam_obj_hypothesis"][i])
         np.testing.assert_allclose([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2], [x0 + side / 2, y0 + side / 2])
-        truth = silhouette_box(tug_target.mesh.vertices_m, s["K"][i], s["T_cam_obj"][i])
-        assert (truth[:2] >= [x0, y0]).all()
-        assert (truth[2:] <= [x0 + side, y0 + side]).all()
+        gt = silhouette_box(tug_target.mesh.vertices_m, s["K"][i], s["T_cam_obj"][i])
+        assert (gt[:2] >= [x0, y0]).all()
+        assert (gt[2:] <= [x0 + side, y0 + side]).all()
         np.testing.assert_allclose(s["K_crop"][i], crop_K(s["K"][i], Window(x0_px=x0, y0_px=y0, side_px=side), 48))
 
 
 @pytest.mark.parametrize("patch_px", [48, 300])  # coarser and finer than the camera's own pixels
-def test_the_picture_shows_the_object_inside_its_contour(maker_of, patch_px):
+def test_the_image_shows_the_object_inside_its_contour(maker_of, patch_px):
     """The colours of S change at the contour: an image that is mirrored or half a pixel off fails."""
     maker = maker_of(f"patch_px={patch_px}", *PLAIN, *SHARP, "sensor.exposure_ev=[0, 0]", "background.photo_fraction=0")
     object_on_black = []
@@ -166,10 +166,10 @@ def test_hypothesis_patches_are_the_object_on_black(maker_of):
     assert np.array_equal(contour, s["hypothesis_distance_px"][0] == 0)
 
 
-def test_a_configuration_that_accepts_nothing_says_what_to_change(maker_of, monkeypatch):
+def test_a_configuration_that_accepts_nothing_names_the_key_to_change(maker_of, monkeypatch):
     with pytest.raises(ConfigError, match=r"tug\.ply\): all 100 draws .* lower window\.min_area_px \(is 100000\)"):
         maker_of("window.min_area_px=100000").samples(0)
-    with pytest.raises(ConfigError, match=r"100 x too much of it hidden.*lower occluders\.min_visible \(is 1\)"):
+    with pytest.raises(ConfigError, match=r"100 x the object too occluded.*lower occluders\.min_visible \(is 1\)"):
         maker_of("occluders.front=[20, 20]", "occluders.min_visible=1.0").samples(0)
     with pytest.raises(ConfigError, match=r"outside the image.*lower view\.position_jitter \(is 0\.6\)"):
         maker_of("view.min_inside=1.0", "camera.fx=9000", "camera.fy=9000").samples(0)

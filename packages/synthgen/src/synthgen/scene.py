@@ -73,7 +73,7 @@ class Pattern:
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """Surface appearance of one object.
+    """Surface appearance of an object.
 
     Attributes:
         base_rgb: Display (sRGB) colour in [0, 1] that replaces the mesh's colours; None keeps them.
@@ -253,7 +253,7 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scene:
-    """Everything that decides the pixels of one image.
+    """Everything that decides the pixels of an image.
 
     Attributes:
         camera: Pinhole camera of the full image.

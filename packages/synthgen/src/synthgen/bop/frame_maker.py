@@ -28,7 +28,6 @@ from synthgen.image import background, sensor
 from synthgen.inputs.assets import Assets
 from synthgen.scene import Background, Scene, SceneObject
 
-Array = np.ndarray
 Split = Literal["test", "val", "train_pbr"]
 
 MAX_ATTEMPTS = 100
@@ -101,13 +100,13 @@ class RenderedFrame:
         T_cam_world: The layout's frame in the camera's.
     """
 
-    rgb: UInt8[Array, "h w 3"]
-    depth_m: Float[Array, "h w"]
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth_m: Float[np.ndarray, "h w"]
     gts: list[GroundTruth]
-    masks: list[Bool[Array, "h3 w3"]]
-    masks_visib: list[Bool[Array, "h w"]]
+    masks: list[Bool[np.ndarray, "h3 w3"]]
+    masks_visib: list[Bool[np.ndarray, "h w"]]
     mask_origin_px: tuple[int, int]
-    T_cam_world: Float[Array, "4 4"]
+    T_cam_world: Float[np.ndarray, "4 4"]
 
 
 class FrameMaker:
@@ -271,7 +270,7 @@ class FrameMaker:
         area_px = float(alone.sum()) * (window.side_px / _VISIBILITY_PX) ** 2
         return area_px, float(visible.sum() / max(alone.sum(), 1))
 
-    def _silhouette(self, placed: SceneObject) -> Bool[Array, "h3 w3"]:
+    def _silhouette(self, placed: SceneObject) -> Bool[np.ndarray, "h3 w3"]:
         """Amodal silhouette on a canvas of three images' width and height; only the object's box is rendered."""
         width, height = self.camera.width_px, self.camera.height_px
         canvas = np.zeros((3 * height, 3 * width), bool)
@@ -297,7 +296,7 @@ class FrameMaker:
         )
 
 
-def _compose(rendered: RenderedScene, scene: Scene, view: CameraView) -> UInt8[Array, "h w 3"]:
+def _compose(rendered: RenderedScene, scene: Scene, view: CameraView) -> UInt8[np.ndarray, "h w 3"]:
     """Composite the render over the background in linear light, and apply the sensor effects."""
     height, width = rendered.alpha.shape
     if view.background_shift_px is None or scene.background.kind == "environment":
@@ -309,7 +308,7 @@ def _compose(rendered: RenderedScene, scene: Scene, view: CameraView) -> UInt8[A
     return sensor.expose(linear, scene.sensor)
 
 
-def _shifted_background(view: CameraView, width: int, height: int) -> UInt8[Array, "h w 3"]:
+def _shifted_background(view: CameraView, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """Part of a background larger than the image, at a subpixel shift."""
     assert view.background_shift_px is not None
     reach_x, reach_y = view.background_reach_px
@@ -321,6 +320,6 @@ def _shifted_background(view: CameraView, width: int, height: int) -> UInt8[Arra
 
 
 @lru_cache(maxsize=2)
-def _canvas(behind: Background, width: int, height: int) -> UInt8[Array, "h w 3"]:
+def _canvas(behind: Background, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
     """Background canvas of a sequence, of which every image shows a part."""
     return background.draw(behind, width, height)

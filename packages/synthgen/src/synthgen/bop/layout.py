@@ -24,8 +24,6 @@ from synthgen.draw.scene_draw import SceneDraw
 from synthgen.draw.target import TargetObject
 from synthgen.scene import Background, Environment, Light, Scene, SceneObject, Sensor, Vector
 
-Array = np.ndarray
-
 _TRIES = 40  # positions tried for a further object before it is left out
 
 
@@ -48,7 +46,7 @@ class Layout:
 
     labelled: tuple[SceneObject, ...]
     others: tuple[SceneObject, ...]
-    T_ref_level: Float[Array, "4 4"]
+    T_ref_level: Float[np.ndarray, "4 4"]
     on_table: bool
     lights: tuple[Light, ...]
     ambient_rgb: Vector
@@ -60,7 +58,7 @@ class Layout:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraView:
-    """A layout as viewed by the camera of one image.
+    """A layout in the view of an image's camera.
 
     Attributes:
         layout: Objects and light.
@@ -72,7 +70,7 @@ class CameraView:
     """
 
     layout: Layout
-    T_cam_ref: Float[Array, "4 4"]
+    T_cam_ref: Float[np.ndarray, "4 4"]
     target_index: int = 0
     background_shift_px: tuple[float, float] | None = None
     background_reach_px: tuple[int, int] = (0, 0)
@@ -98,7 +96,7 @@ class CameraView:
         )
 
 
-def transformed_light(light: Light, T_cam_ref: Float[Array, "4 4"]) -> Light:
+def transformed_light(light: Light, T_cam_ref: Float[np.ndarray, "4 4"]) -> Light:
     """A lamp transformed to another camera's frame."""
     position = T_cam_ref[:3, :3] @ np.array(light.position_cam_m) + T_cam_ref[:3, 3]
     return replace(
@@ -106,7 +104,7 @@ def transformed_light(light: Light, T_cam_ref: Float[Array, "4 4"]) -> Light:
     )
 
 
-def transformed_direction(direction: Vector, T_cam_ref: Float[Array, "4 4"]) -> Vector:
+def transformed_direction(direction: Vector, T_cam_ref: Float[np.ndarray, "4 4"]) -> Vector:
     """A direction transformed to another camera's frame."""
     return as_vector(T_cam_ref[:3, :3] @ np.array(direction))
 
@@ -117,12 +115,12 @@ class BoundingSpheres:
 
     meshes: Mapping[int, Mesh]
 
-    def sphere(self, placed: SceneObject) -> tuple[Float[Array, "3"], float]:
+    def sphere(self, placed: SceneObject) -> tuple[Float[np.ndarray, "3"], float]:
         """Centre, in the frame of the pose, and radius."""
         mesh, T = self.meshes[placed.mesh_key], placed.T_cam_obj
         return mesh.center_cam_m(T), radius_m(mesh)
 
-    def is_free(self, centre: Float[Array, "3"], radius: float, placed: Sequence[SceneObject]) -> bool:
+    def is_free(self, centre: Float[np.ndarray, "3"], radius: float, placed: Sequence[SceneObject]) -> bool:
         """Whether a sphere is disjoint from those of all placed objects."""
         return all(np.linalg.norm(centre - c) >= radius + r for c, r in map(self.sphere, placed))
 
@@ -190,7 +188,7 @@ def draw_layout(
 
 def draw_camera(
     rng: np.random.Generator, config: SynthConfig, targets: Mapping[int, TargetObject], layout: Layout
-) -> tuple[int, Float[Array, "4 4"]]:
+) -> tuple[int, Float[np.ndarray, "4 4"]]:
     """Draw a camera that is aimed at one of a layout's objects, within the object's range of distances.
 
     Over a table, and for upright views, elevations are uniform on the sphere's zone and the image is level but for the
@@ -219,7 +217,7 @@ def draw_camera(
     return number, make_T(R, point_at_pixel(camera, position, z_m) - R @ centre)
 
 
-def clearance_m(spheres: BoundingSpheres, placed: Sequence[SceneObject], T_cam_ref: Float[Array, "4 4"]) -> float:
+def clearance_m(spheres: BoundingSpheres, placed: Sequence[SceneObject], T_cam_ref: Float[np.ndarray, "4 4"]) -> float:
     """Distance from a camera to the nearest bounding sphere; negative inside a sphere, infinite without objects."""
     eye = inverse(T_cam_ref)[:3, 3]
     return min((float(np.linalg.norm(c - eye)) - r for c, r in map(spheres.sphere, placed)), default=math.inf)
@@ -251,7 +249,7 @@ def _floating(
     placed: Sequence[SceneObject],
     others: Sequence[SceneObject],
     together: bool,
-) -> Float[Array, "4 4"] | None:
+) -> Float[np.ndarray, "4 4"] | None:
     radius, camera = radius_m(target.mesh), config.camera.camera()
     for _ in range(_TRIES):
         T = draw_pose(rng, config.view, camera, target)
@@ -272,7 +270,7 @@ def _beside(
     table: SceneObject,
     placed: Sequence[SceneObject],
     targets: Sequence[TargetObject],
-) -> Float[Array, "4 4"] | None:
+) -> Float[np.ndarray, "4 4"] | None:
     """Pose at rest on the scene's table, next to a labelled object; None without a free position."""
     T_table_ref = inverse(table.T_cam_obj)
     circle = _circles(base, targets, T_table_ref)
@@ -303,7 +301,7 @@ def _beside(
 
 
 def _circles(
-    base: SceneDraw, targets: Sequence[TargetObject], T_table_ref: Float[Array, "4 4"]
+    base: SceneDraw, targets: Sequence[TargetObject], T_table_ref: Float[np.ndarray, "4 4"]
 ) -> Callable[[SceneObject], tuple[float, float, float]]:
     """A function that computes the footprint circle of a placed object as seen from above."""
     hulls = {t.obj_id: t.hull_m for t in targets}
@@ -320,7 +318,7 @@ def _circles(
     return circle
 
 
-def _level_of(config: SynthConfig, base: SceneDraw) -> Float[Array, "4 4"]:
+def _level_of(config: SynthConfig, base: SceneDraw) -> Float[np.ndarray, "4 4"]:
     """A frame with z up, without a table: the object's where it stands upright, else the camera's (y down)."""
     if config.view.viewpoint == "upright":
         return base.T_cam_obj

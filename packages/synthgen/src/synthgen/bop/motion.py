@@ -23,8 +23,6 @@ from synthgen.draw.random_streams import Purpose, Subject, child_seed, stream
 from synthgen.draw.target import TargetObject
 from synthgen.scene import Light, SceneObject
 
-Array = np.ndarray
-
 _TERMS = 2
 _GAP_FRACTION = 0.45  # largest displacement of a floating object as a fraction of the gap to its neighbour
 _OCCLUDER_TRIES = 20
@@ -37,9 +35,9 @@ _LIGHT_ROTATION_RAD = 0.5
 class Wave:
     """A smooth function of time with values in [-amplitude, amplitude]."""
 
-    amplitudes: Float[Array, " k"]
-    rates_rad_s: Float[Array, " k"]
-    phases_rad: Float[Array, " k"]
+    amplitudes: Float[np.ndarray, " k"]
+    rates_rad_s: Float[np.ndarray, " k"]
+    phases_rad: Float[np.ndarray, " k"]
 
     def __call__(self, t_s: float) -> float:
         """Value at a time."""
@@ -71,7 +69,7 @@ class SmoothRotation:
 
     rotvec_rad: tuple[Wave, Wave, Wave]
 
-    def __call__(self, t_s: float) -> Float[Array, "3 3"]:
+    def __call__(self, t_s: float) -> Float[np.ndarray, "3 3"]:
         """Rotation at a time."""
         return rotation_from_rotvec(np.array([wave(t_s) for wave in self.rotvec_rad]))
 
@@ -112,7 +110,7 @@ class PassingOccluder:
     depth_fraction: float
     middle_s: float
     speed_m_s: float
-    direction_cam: Float[Array, "3"]
+    direction_cam: Float[np.ndarray, "3"]
 
 
 class Motion:
@@ -186,7 +184,7 @@ class Motion:
             background_reach_px=(math.ceil(reach[0]) + 1, math.ceil(reach[1]) + 1),
         )
 
-    def T_cam_ref(self, t_s: float) -> Float[Array, "4 4"]:
+    def T_cam_ref(self, t_s: float) -> Float[np.ndarray, "4 4"]:
         """Pose of the reference frame in the moving camera's frame."""
         z_m = self._nearest_m + (self._farthest_m - self._nearest_m) * (1 + self._waves[2](t_s)) / 2
         R = self._R_cam_ref(t_s)
@@ -228,7 +226,7 @@ class Motion:
             for speed, amplitude in zip(speed_m_s, amplitudes_m, strict=True)
         ]
 
-    def _position(self, t_s: float) -> Float[Array, "2"]:
+    def _position(self, t_s: float) -> Float[np.ndarray, "2"]:
         return self._jitter * np.array([self._waves[0](t_s), self._waves[1](t_s)])
 
     def _draw_direction(self, rng: np.random.Generator, max_speed_rad_s: float) -> None:
@@ -247,7 +245,7 @@ class Motion:
             draw_wave(rng, float(np.ptp(r)) / 2, speed, period_s) for r, speed in zip(ranges, speeds, strict=True)
         ]
 
-    def _R_cam_ref(self, t_s: float) -> Float[Array, "3 3"]:
+    def _R_cam_ref(self, t_s: float) -> Float[np.ndarray, "3 3"]:
         if not self._is_level:
             return self._rotation(t_s) @ self._R_initial
         elevation, azimuth, roll = (

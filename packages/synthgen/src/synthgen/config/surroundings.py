@@ -84,8 +84,8 @@ class MaterialConfig:
 
     Attributes:
         textureless_fraction: Fraction of scenes with the object's mean colour all over.
-        random_colour_fraction: Fraction of scenes with random colours: half of them plain, half a procedural texture
-            of two colours.
+        random_colour_fraction: Fraction of scenes with random colours: half plain, half with a procedural texture of
+            two colours.
         hue_shift: Largest hue rotation in turns, either way.
         saturation: Factor on the saturation.
         value: Factor on the brightness.

@@ -15,14 +15,12 @@ from synthgen.draw.random_streams import child_seed
 from synthgen.draw.target import TargetObject
 from synthgen.scene import Background, Environment, Light, Material, Pattern, Sensor, Vector
 
-Array = np.ndarray
-
 _CEILING_HEIGHT = 2.0  # of the ceiling lamp, in units of the largest distance of lamps
 _CEILING_SIDE = 0.6  # of the ceiling lamp, in units of its height
 
 
 def draw_lights(
-    rng: np.random.Generator, config: LightConfig, centre_cam_m: Float[Array, "3"], diameter_m: float
+    rng: np.random.Generator, config: LightConfig, centre_cam_m: Float[np.ndarray, "3"], diameter_m: float
 ) -> tuple[tuple[Light, ...], Vector]:
     """Draw lamps around the object, mostly on the camera's side, and the ambient light.
 
@@ -61,8 +59,8 @@ def draw_lights(
 def draw_ceiling_lights(
     rng: np.random.Generator,
     config: LightConfig,
-    T_ref_level: Float[Array, "4 4"],
-    centre_m: Float[Array, "3"],
+    T_ref_level: Float[np.ndarray, "4 4"],
+    centre_m: Float[np.ndarray, "3"],
     diameter_m: float,
 ) -> tuple[tuple[Light, ...], Vector]:
     """Draw light as in a room: a large lamp overhead, a small lamp on a shell around the object, and ambient light.
@@ -146,7 +144,7 @@ def _pattern(rng: np.random.Generator, diameter_m: float) -> Pattern:
 
 
 def draw_environment(
-    rng: np.random.Generator, config: SynthConfig, hdris: Sequence[str], R_cam_level: Float[Array, "3 3"]
+    rng: np.random.Generator, config: SynthConfig, hdris: Sequence[str], R_cam_level: Float[np.ndarray, "3 3"]
 ) -> tuple[Environment | None, bool]:
     """Draw the panorama that lights a scene, or None, and whether it is the background.
 
@@ -189,12 +187,12 @@ def draw_sensor(rng: np.random.Generator, config: SensorConfig) -> Sensor:
     )
 
 
-def _tinted(rng: np.random.Generator, strength: float) -> Float[Array, "3"]:
+def _tinted(rng: np.random.Generator, strength: float) -> Float[np.ndarray, "3"]:
     """A light colour between white and, at strength 1, any colour; its brightest channel is 1."""
     colour = 1.0 - strength * rng.random(3)
     return np.asarray(colour / colour.max())
 
 
-def as_vector(values: Float[Array, "3"]) -> Vector:
+def as_vector(values: Float[np.ndarray, "3"]) -> Vector:
     """Three plain floats."""
     return (float(values[0]), float(values[1]), float(values[2]))

@@ -15,8 +15,6 @@ from synthgen.config import OccluderConfig
 from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.scene import Material, SceneObject
 
-Array = np.ndarray
-
 _SHARP_EDGE_RAD = 0.6  # dihedral angle from which an edge is shaded flat
 _MAX_DISTANCE_FRACTION = 0.6  # a larger shape does not fit between camera and object
 _EXTRA_FRONT = 4  # maximum number of shapes added to reach a visible fraction
@@ -55,7 +53,7 @@ def draw_occluders(
     rng: np.random.Generator,
     config: OccluderConfig,
     shapes: Mapping[int, Mesh],
-    centre_cam_m: Float[Array, "3"],
+    centre_cam_m: Float[np.ndarray, "3"],
     diameter_m: float,
 ) -> tuple[tuple[SceneObject, ...], tuple[SceneObject, ...]]:
     """Draw shapes in front of and around an object whose box centre is at `centre_cam_m`.
@@ -82,7 +80,7 @@ def move_in_front(
     rng: np.random.Generator,
     config: OccluderConfig,
     shapes: Mapping[int, Mesh],
-    centre_cam_m: Float[Array, "3"],
+    centre_cam_m: Float[np.ndarray, "3"],
     diameter_m: float,
     front: Sequence[SceneObject],
     visible_of: Callable[[tuple[SceneObject, ...]], float],
@@ -143,7 +141,7 @@ def _path(
     rng: np.random.Generator,
     item: SceneObject,
     shape: Mesh,
-    centre_cam_m: Float[Array, "3"],
+    centre_cam_m: Float[np.ndarray, "3"],
     diameter_m: float,
     lift: Callable[[SceneObject], SceneObject],
 ) -> Callable[[float], SceneObject]:
@@ -165,8 +163,8 @@ def _path(
 
 
 def _in_front(
-    rng: np.random.Generator, centre_cam_m: Float[Array, "3"], diameter_m: float, size_m: float
-) -> Float[Array, "3"]:
+    rng: np.random.Generator, centre_cam_m: Float[np.ndarray, "3"], diameter_m: float, size_m: float
+) -> Float[np.ndarray, "3"]:
     z = centre_cam_m[2]
     gap = (diameter_m + size_m) / 2
     front = max(z - gap - rng.uniform(0.0, 0.3) * z, size_m, 0.3 * z)
@@ -176,8 +174,8 @@ def _in_front(
 
 
 def _around(
-    rng: np.random.Generator, centre_cam_m: Float[Array, "3"], diameter_m: float, size_m: float
-) -> Float[Array, "3"]:
+    rng: np.random.Generator, centre_cam_m: Float[np.ndarray, "3"], diameter_m: float, size_m: float
+) -> Float[np.ndarray, "3"]:
     gap = (diameter_m + size_m) / 2
     if rng.random() < 0.5:  # behind
         depth, reach = gap + rng.uniform(0.0, 2.0) * diameter_m, rng.uniform(0.0, 1.5) * gap
@@ -186,13 +184,13 @@ def _around(
     return np.asarray(centre_cam_m + _sideways(rng) * reach + np.array([0.0, 0.0, depth]))
 
 
-def _sideways(rng: np.random.Generator) -> Float[Array, "3"]:
+def _sideways(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     angle = rng.uniform(0, 2 * np.pi)
     return np.array([np.cos(angle), np.sin(angle), 0.0])
 
 
 def _object(
-    rng: np.random.Generator, shapes: Mapping[int, Mesh], key: int, position_cam_m: Float[Array, "3"]
+    rng: np.random.Generator, shapes: Mapping[int, Mesh], key: int, position_cam_m: Float[np.ndarray, "3"]
 ) -> SceneObject:
     R = random_rotation(rng)
     t = position_cam_m - R @ shapes[key].center_m
@@ -244,7 +242,7 @@ def _shape(rng: np.random.Generator, index: int, size_m: float) -> Mesh:
     )
 
 
-def _colours(rng: np.random.Generator, vertices: Float[Array, "v 3"]) -> Array:
+def _colours(rng: np.random.Generator, vertices: Float[np.ndarray, "v 3"]) -> np.ndarray:
     """Two or three colours in bands across the shape; edges are as sharp as the vertices are dense."""
     palette = rng.integers(0, 256, (int(rng.integers(2, 4)), 3))
     axis = rng.normal(size=3)

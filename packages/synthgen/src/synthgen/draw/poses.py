@@ -12,10 +12,10 @@ from posecore.window import silhouette_box
 from synthgen.config import PerturbationConfig, ViewConfig
 from synthgen.draw.target import TargetObject
 
-Array = np.ndarray
 
-
-def draw_pose(rng: np.random.Generator, view: ViewConfig, camera: Camera, target: TargetObject) -> Float[Array, "4 4"]:
+def draw_pose(
+    rng: np.random.Generator, view: ViewConfig, camera: Camera, target: TargetObject
+) -> Float[np.ndarray, "4 4"]:
     """Draw a true pose: rotation by `view.viewpoint`, distance uniform, box centre around the image's middle."""
     if view.viewpoint == "so3":
         R = random_rotation(rng)
@@ -25,8 +25,8 @@ def draw_pose(rng: np.random.Generator, view: ViewConfig, camera: Camera, target
 
 
 def pose_at_distance(
-    rng: np.random.Generator, view: ViewConfig, camera: Camera, target: TargetObject, R: Float[Array, "3 3"]
-) -> Float[Array, "4 4"]:
+    rng: np.random.Generator, view: ViewConfig, camera: Camera, target: TargetObject, R: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "4 4"]:
     """Draw the distance and the image position of a true pose with the given rotation."""
     z_m = rng.uniform(*target.distance_m)
     centre = point_at_pixel(camera, view.position_jitter * rng.uniform(-1.0, 1.0, 2), z_m)
@@ -35,14 +35,14 @@ def pose_at_distance(
 
 def draw_level_rotation(
     rng: np.random.Generator, elevation_deg: tuple[float, float], roll_deg: tuple[float, float]
-) -> Float[Array, "3 3"]:
+) -> Float[np.ndarray, "3 3"]:
     """Draw a `level_rotation`: elevation uniform on the sphere's zone, azimuth and roll uniform."""
     low, high = np.sin(np.deg2rad(elevation_deg))
     elevation, azimuth = math.asin(rng.uniform(low, high)), rng.uniform(0, 2 * math.pi)
     return level_rotation(elevation, azimuth, math.radians(rng.uniform(*roll_deg)))
 
 
-def level_rotation(elevation_rad: float, azimuth_rad: float, roll_rad: float) -> Float[Array, "3 3"]:
+def level_rotation(elevation_rad: float, azimuth_rad: float, roll_rad: float) -> Float[np.ndarray, "3 3"]:
     """Rotation to a camera whose optical axis points at the origin of a frame with z up.
 
     Args:
@@ -58,7 +58,7 @@ def level_rotation(elevation_rad: float, azimuth_rad: float, roll_rad: float) ->
     return np.asarray(rotation_from_rotvec(np.array([0.0, 0.0, roll_rad])) @ level)
 
 
-def point_at_pixel(camera: Camera, position: Float[Array, "2"], z_m: float) -> Float[Array, "3"]:
+def point_at_pixel(camera: Camera, position: Float[np.ndarray, "2"], z_m: float) -> Float[np.ndarray, "3"]:
     """Point in the camera frame at a depth and an image position, from -1 to 1 across the image."""
     uv = np.array([camera.width_px, camera.height_px]) / 2 * (1.0 + position)
     focal, principal = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
@@ -66,8 +66,8 @@ def point_at_pixel(camera: Camera, position: Float[Array, "2"], z_m: float) -> F
 
 
 def draw_hypothesis(
-    rng: np.random.Generator, config: PerturbationConfig, T_cam_obj: Float[Array, "4 4"], mesh: Mesh
-) -> Float[Array, "4 4"]:
+    rng: np.random.Generator, config: PerturbationConfig, T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh
+) -> Float[np.ndarray, "4 4"]:
     """Perturb a true pose: rotate it about the object's box centre and translate it.
 
     The pivot is the box centre and not the origin, because a mesh whose origin is far off its surface would leave the
@@ -82,12 +82,12 @@ def draw_hypothesis(
     return make_T(R, centre - R @ mesh.center_m)
 
 
-def target_box(target: TargetObject, camera: Camera, T_cam_obj: Float[Array, "4 4"]) -> Float[Array, "4"]:
+def target_box(target: TargetObject, camera: Camera, T_cam_obj: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4"]:
     """Box (x0, y0, x1, y1) of the target object's silhouette in full-image pixels."""
     return silhouette_box(target.hull_m, camera.K, T_cam_obj)
 
 
-def fraction_inside(box_px: Float[Array, "4"], camera: Camera) -> float:
+def fraction_inside(box_px: Float[np.ndarray, "4"], camera: Camera) -> float:
     """Fraction of a silhouette's box (x0, y0, x1, y1) inside the image; 0 for an infinite box."""
     x0, y0, x1, y1 = box_px
     if not np.isfinite(box_px).all():

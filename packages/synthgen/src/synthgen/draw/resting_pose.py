@@ -9,8 +9,6 @@ from posecore.mesh import Mesh
 from posecore.se3 import even_directions
 from scipy.spatial import ConvexHull, QhullError
 
-Array = np.ndarray
-
 _DROPS = 2048  # evenly spaced directions in which a mesh is dropped
 _MAX_HULL_POINTS = 600  # a hull with more vertices is reduced to those extreme in one of as many directions
 _TOLERANCE = 1e-6  # fraction of the diameter within which planes and heights are equal
@@ -18,7 +16,7 @@ _TOLERANCE = 1e-6  # fraction of the diameter within which planes and heights ar
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StablePoses:
-    """Stable poses of one mesh.
+    """Stable poses of a mesh.
 
     Attributes:
         hull_m: (h, 3) vertices of the convex hull, object coordinates.
@@ -26,9 +24,9 @@ class StablePoses:
         weights: (k,) probability of each after a drop in a random orientation; they sum to 1.
     """
 
-    hull_m: Float[Array, "h 3"]
-    down: Float[Array, "k 3"]
-    weights: Float[Array, " k"]
+    hull_m: Float[np.ndarray, "h 3"]
+    down: Float[np.ndarray, "k 3"]
+    weights: Float[np.ndarray, " k"]
 
 
 def find_stable_poses(mesh: Mesh) -> StablePoses:
@@ -81,18 +79,20 @@ class StablePosesByKey(dict[int, StablePoses]):
         return self[key]
 
 
-def _hit(normals: Float[Array, "f 3"], height: Float[Array, " f"], rays: Float[Array, "r 3"]) -> Array:
+def _hit(
+    normals: Float[np.ndarray, "f 3"], height: Float[np.ndarray, " f"], rays: Float[np.ndarray, "r 3"]
+) -> np.ndarray:
     """Facet through which each ray from the centre of mass leaves the hull."""
     slope = rays @ normals.T
     with np.errstate(divide="ignore"):
         return np.asarray(np.where(slope > 1e-9, height / np.maximum(slope, 1e-9), np.inf).argmin(axis=1))
 
 
-def _extreme(points: Float[Array, "p 3"]) -> Float[Array, "q 3"]:
+def _extreme(points: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "q 3"]:
     return np.asarray(points[np.unique((points @ even_directions(_MAX_HULL_POINTS).T).argmax(axis=0))])
 
 
-def _centre_of_mass(mesh: Mesh, hull: ConvexHull) -> Float[Array, "3"]:
+def _centre_of_mass(mesh: Mesh, hull: ConvexHull) -> Float[np.ndarray, "3"]:
     middle = hull.points[hull.vertices].mean(axis=0)
     if mesh.is_closed:
         corners = mesh.vertices_m[mesh.faces] - middle

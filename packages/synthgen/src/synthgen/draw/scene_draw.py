@@ -16,8 +16,6 @@ from synthgen.draw.target import TargetObject
 from synthgen.inputs.assets import Assets
 from synthgen.scene import Background, Environment, Light, Material, Scene, SceneObject, Sensor, Vector
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneDraw:
@@ -40,7 +38,7 @@ class SceneDraw:
 
     address: tuple[Purpose, int, int]
     target: TargetObject
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     front: tuple[SceneObject, ...]
     around: tuple[SceneObject, ...]
     material: Material
@@ -151,7 +149,7 @@ def _is_tabletop(config: SynthConfig, purpose: Purpose, scene_index: int) -> boo
 
 def _draw_poses(
     config: SynthConfig, target: TargetObject, rng: Callable[[Subject], np.random.Generator], is_tabletop: bool
-) -> tuple[Float[Array, "4 4"], Float[Array, "4 4"], tabletop.Placement | None]:
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "4 4"], tabletop.Placement | None]:
     """Poses of the object and of the table (of a level frame in a cutout scene), and the placement on the table."""
     pose_rng, camera = rng(Subject.POSE), config.camera.camera()
     R_cam_table = draw_level_rotation(rng(Subject.VIEW), config.tabletop.elevation_deg, config.view.roll_deg)

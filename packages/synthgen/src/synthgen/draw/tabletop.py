@@ -19,7 +19,6 @@ from synthgen.draw.resting_pose import StablePoses
 from synthgen.image import background
 from synthgen.scene import Background, Material, SceneObject
 
-Array = np.ndarray
 MaterialOf = Callable[[np.random.Generator], Material]
 
 TABLE_KEY = -1_000_000  # mesh keys of tables are below this
@@ -40,7 +39,7 @@ class Placement:
         footprint_m: (x, y, radius) of the circle around the object as seen from above.
     """
 
-    T_table_obj: Float[Array, "4 4"]
+    T_table_obj: Float[np.ndarray, "4 4"]
     table_key: int
     footprint_m: tuple[float, float, float]
 
@@ -97,7 +96,7 @@ def surroundings(
     rng: np.random.Generator,
     config: TabletopConfig,
     placement: Placement,
-    T_cam_table: Float[Array, "4 4"],
+    T_cam_table: Float[np.ndarray, "4 4"],
     shapes: Mapping[int, Mesh],
     stable_poses: Mapping[int, StablePoses],
     tables: Mapping[int, Mesh],
@@ -134,7 +133,7 @@ def surroundings(
     return tuple(placed)
 
 
-def raise_above_table(item: SceneObject, mesh: Mesh, T_cam_table: Float[Array, "4 4"]) -> SceneObject:
+def raise_above_table(item: SceneObject, mesh: Mesh, T_cam_table: Float[np.ndarray, "4 4"]) -> SceneObject:
     """A floating object, moved along its viewing ray until it is wholly above the table; its direction stays the same.
 
     An object that does not fit between camera and plane stays where it is.
@@ -153,8 +152,8 @@ def raise_above_table(item: SceneObject, mesh: Mesh, T_cam_table: Float[Array, "
 
 
 def _standing(
-    R_table_obj: Float[Array, "3 3"], stable: StablePoses, height_m: float
-) -> tuple[Float[Array, "4 4"], float]:
+    R_table_obj: Float[np.ndarray, "3 3"], stable: StablePoses, height_m: float
+) -> tuple[Float[np.ndarray, "4 4"], float]:
     """Pose over the table's middle with the lowest point at a height, and the footprint's radius."""
     points = stable.hull_m @ R_table_obj.T
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -162,12 +161,12 @@ def _standing(
     return T, float(np.linalg.norm(points[:, :2] - centre[:2], axis=1).max())
 
 
-def _middle(T_table_obj: Float[Array, "4 4"], stable: StablePoses) -> Float[Array, "2"]:
+def _middle(T_table_obj: Float[np.ndarray, "4 4"], stable: StablePoses) -> Float[np.ndarray, "2"]:
     points = apply(T_table_obj, stable.hull_m)[:, :2]
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def _rotation_to_down(direction: Float[Array, "3"]) -> Float[Array, "3 3"]:
+def _rotation_to_down(direction: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
     """A rotation that maps a direction of the object to straight down."""
     x = np.cross(np.eye(3)[np.argmin(np.abs(direction))], direction)
     x /= np.linalg.norm(x)
@@ -196,7 +195,9 @@ def _table(config: TabletopConfig, seed: int, size: int, index: int, photos: Seq
     )
 
 
-def _texture(rng: np.random.Generator, width_px: int, height_px: int, photos: Sequence[str]) -> UInt8[Array, "h w 3"]:
+def _texture(
+    rng: np.random.Generator, width_px: int, height_px: int, photos: Sequence[str]
+) -> UInt8[np.ndarray, "h w 3"]:
     from_photo, kind, child = rng.random() < 0.5, rng.random(), child_seed(rng)
     if photos and from_photo:
         path = photos[int(rng.integers(len(photos)))]
@@ -206,7 +207,7 @@ def _texture(rng: np.random.Generator, width_px: int, height_px: int, photos: Se
     return background.draw(Background(seed=child), width_px, height_px)
 
 
-def _wood(rng: np.random.Generator, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+def _wood(rng: np.random.Generator, width_px: int, height_px: int) -> UInt8[np.ndarray, "h w 3"]:
     """Boards with grain: elongated noise between two browns."""
     boards = int(rng.integers(1, 7))
     hue, light, dark = rng.uniform(0.0, 0.25), rng.uniform(0.4, 0.9), rng.uniform(0.1, 0.4)

@@ -16,8 +16,6 @@ from synthgen.draw import occluders, tabletop
 from synthgen.draw.resting_pose import StablePosesByKey
 from synthgen.inputs.assets import Assets
 
-Array = np.ndarray
-
 # Mesh keys below this are object ids, from here on keys of library shapes.
 LIBRARY_KEY = 1_000_000
 # Occluder meshes of unscaled size are common to all objects: their keys are below this, those of tables far below.
@@ -44,7 +42,7 @@ class TargetObject:
     obj_id: int
     name: str
     mesh: Mesh
-    hull_m: Float[Array, "h 3"]
+    hull_m: Float[np.ndarray, "h 3"]
     distance_m: tuple[float, float]
     window_side_px: float
     shapes: Mapping[int, Mesh]
@@ -57,7 +55,7 @@ class TargetObject:
         return StablePosesByKey({self.obj_id: self.mesh, **self.shapes})
 
     @cached_property
-    def mean_rgb(self) -> Float[Array, "3"]:
+    def mean_rgb(self) -> Float[np.ndarray, "3"]:
         """Mean display colour of the surface, in [0, 1], faces weighted by their area."""
         corners = self.mesh.vertices_m[self.mesh.faces]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -109,7 +107,7 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
     )
 
 
-def hull(mesh: Mesh) -> Float[Array, "h 3"]:
+def hull(mesh: Mesh) -> Float[np.ndarray, "h 3"]:
     """Vertices of the convex hull; all vertices of a flat object, whose hull has no volume."""
     try:
         return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices])

@@ -12,15 +12,14 @@ from posecore.errors import ConfigError
 from synthgen.image import hdri
 from synthgen.scene import Background, Scene
 
-Array = np.ndarray
-Canvas = Float[Array, "h w 3"]
+Canvas = Float[np.ndarray, "h w 3"]
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 PHOTO_SIDE_PX = 1280  # photographs are reduced to this side: enough for a crop, and many fit in memory
 PHOTOS_IN_MEMORY = 48
 
 
-def render_background(scene: Scene, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+def render_background(scene: Scene, width_px: int, height_px: int) -> UInt8[np.ndarray, "h w 3"]:
     """The background of a scene in display colours.
 
     Args:
@@ -38,7 +37,7 @@ def render_background(scene: Scene, width_px: int, height_px: int) -> UInt8[Arra
     return draw(scene.background, width_px, height_px)
 
 
-def draw(background: Background, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+def draw(background: Background, width_px: int, height_px: int) -> UInt8[np.ndarray, "h w 3"]:
     """Draw a background in display colours; the same background and size give the same bytes.
 
     Raises:
@@ -73,7 +72,7 @@ def list_photos(folder: str | Path) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=PHOTOS_IN_MEMORY)
-def _photo(path: str) -> UInt8[Array, "h w 3"]:
+def _photo(path: str) -> UInt8[np.ndarray, "h w 3"]:
     image = cv2.imread(path, cv2.IMREAD_COLOR)
     if image is None:
         raise ConfigError(f"{path}: cannot be read as an image; remove it from the backgrounds folder")
@@ -84,8 +83,8 @@ def _photo(path: str) -> UInt8[Array, "h w 3"]:
 
 
 def _crop(
-    photo: UInt8[Array, "a b 3"], rng: np.random.Generator, width_px: int, height_px: int
-) -> UInt8[Array, "h w 3"]:
+    photo: UInt8[np.ndarray, "a b 3"], rng: np.random.Generator, width_px: int, height_px: int
+) -> UInt8[np.ndarray, "h w 3"]:
     """A random crop with the given aspect ratio, from a quarter of the largest possible size to all."""
     height, width = photo.shape[:2]
     largest = min(width / width_px, height / height_px)
@@ -98,7 +97,7 @@ def _crop(
     return np.asarray(cv2.resize(np.ascontiguousarray(crop), (width_px, height_px), interpolation=interpolation))
 
 
-def _procedural(rng: np.random.Generator, width_px: int, height_px: int) -> UInt8[Array, "h w 3"]:
+def _procedural(rng: np.random.Generator, width_px: int, height_px: int) -> UInt8[np.ndarray, "h w 3"]:
     canvas = _LAYERS[int(rng.integers(len(_LAYERS)))](rng, width_px, height_px)
     if rng.random() < 0.35:  # a blend of two kinds
         other = _LAYERS[int(rng.integers(len(_LAYERS)))](rng, width_px, height_px)
@@ -116,7 +115,7 @@ def _procedural(rng: np.random.Generator, width_px: int, height_px: int) -> UInt
     return np.asarray((np.clip(canvas, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))
 
 
-def _colour(rng: np.random.Generator) -> Float[Array, "3"]:
+def _colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A random colour, nearly grey with probability one half, as in photographs."""
     grey = rng.random()
     saturation = rng.uniform(0.0, 0.25) if rng.random() < 0.5 else rng.uniform(0.25, 1.0)
@@ -133,7 +132,7 @@ def _gradient(rng: np.random.Generator, width_px: int, height_px: int) -> Canvas
 
 def _noise(
     rng: np.random.Generator, width_px: int, height_px: int, *, channels: int = 3, octaves: int = 6
-) -> Float[Array, "h w c"]:
+) -> Float[np.ndarray, "h w c"]:
     """Smooth noise of several octaves, normalised to [0, 1]."""
     total = np.zeros((height_px, width_px, channels), np.float32)
     roughness = rng.uniform(0.4, 0.9)

@@ -7,10 +7,8 @@ from synthgen.engine import RenderedScene
 from synthgen.image import background, sensor
 from synthgen.scene import Scene
 
-Array = np.ndarray
 
-
-def compose(rendered: RenderedScene, scene: Scene) -> UInt8[Array, "h w 3"]:
+def compose(rendered: RenderedScene, scene: Scene) -> UInt8[np.ndarray, "h w 3"]:
     """Composite the render over the scene's background in linear light, and apply the sensor effects."""
     height, width = rendered.alpha.shape
     behind = sensor.linear_from_display(background.render_background(scene, width, height))
@@ -18,7 +16,7 @@ def compose(rendered: RenderedScene, scene: Scene) -> UInt8[Array, "h w 3"]:
     return sensor.expose(rendered.rgb_linear * alpha + behind * (1 - alpha), scene.sensor)
 
 
-def on_black(rendered: RenderedScene) -> UInt8[Array, "h w 3"]:
+def on_black(rendered: RenderedScene) -> UInt8[np.ndarray, "h w 3"]:
     """The render on black in display values, as for a hypothesis."""
     display = sensor.display_from_linear(rendered.rgb_linear * rendered.alpha[..., None])
     return np.asarray((display * np.float32(255.0) + np.float32(0.5)).astype(np.uint8))

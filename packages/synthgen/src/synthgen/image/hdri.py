@@ -14,8 +14,6 @@ from posecore.errors import ConfigError
 from synthgen.image.sensor import display_from_linear
 from synthgen.scene import Background, Environment, Light, Scene
 
-Array = np.ndarray
-
 SUFFIXES = (".hdr", ".exr")
 LIGHT_SIZE_PX = (512, 256)  # resolution for lighting: a renderer's importance map is no finer
 VIEW_WIDTH_PX = 2048  # resolution as a background
@@ -37,8 +35,8 @@ class Panorama:
         view: (h, w, 3) linear radiance at a higher resolution, in half precision.
     """
 
-    light: Float[Array, "256 512 3"]
-    view: Float[Array, "h w 3"]
+    light: Float[np.ndarray, "256 512 3"]
+    view: Float[np.ndarray, "h w 3"]
 
 
 def list_hdris(folder: str | Path) -> tuple[str, ...]:
@@ -83,8 +81,8 @@ def load(path: str) -> Panorama:
 
 
 def crop(
-    environment: Environment, K: Float[Array, "3 3"], region_px: tuple[int, int, int, int]
-) -> UInt8[Array, "h w 3"]:
+    environment: Environment, K: Float[np.ndarray, "3 3"], region_px: tuple[int, int, int, int]
+) -> UInt8[np.ndarray, "h w 3"]:
     """The panorama in a region of a camera's image plane, display colours.
 
     Args:
@@ -126,9 +124,9 @@ class SplitLight:
             angle that it subtends, rad.
     """
 
-    residual: Float[Array, "256 512 3"]
-    ambient: Float[Array, "3"]
-    suns: tuple[tuple[Float[Array, "3"], Float[Array, "3"], float], ...]
+    residual: Float[np.ndarray, "256 512 3"]
+    ambient: Float[np.ndarray, "3"]
+    suns: tuple[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float], ...]
 
 
 @lru_cache(maxsize=IN_MEMORY)
@@ -146,7 +144,7 @@ def split_light(path: str) -> SplitLight:
     clipped = light * np.minimum(1.0, _CUT_LEVEL / np.maximum(light.mean(axis=2, keepdims=True), 1e-9))
     cut = (light - clipped) * weights[..., None]
     energy, total = cut.mean(axis=2), float((light.mean(axis=2) * weights).sum())
-    suns: list[tuple[Float[Array, "3"], Float[Array, "3"], float]] = []
+    suns: list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], float]] = []
     while len(suns) < _MAX_SUNS and energy.max() > 0.0 and energy.sum() > _MIN_SUN_FRACTION * total:
         peak = directions[np.unravel_index(energy.argmax(), energy.shape)]
         here = (directions @ peak > math.cos(_SUN_RADIUS_RAD)) & (energy > 0.0)
@@ -161,7 +159,7 @@ def split_light(path: str) -> SplitLight:
     return SplitLight(residual=residual.astype(np.float32), ambient=ambient.astype(np.float64), suns=tuple(suns))
 
 
-def _blurred_radiance(cut: Float[Array, "h w 3"], weights: Float[Array, "h w"]) -> Float[Array, "h w 3"]:
+def _blurred_radiance(cut: Float[np.ndarray, "h w 3"], weights: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """Radiance of light (radiance times solid angle) after a blur of about 20 degrees that preserves the total."""
     around = cut.shape[1] // 2
     padded = np.concatenate([cut[:, -around:], cut, cut[:, :around]], axis=1)  # columns are periodic
@@ -207,7 +205,7 @@ def with_lamps(scene: Scene) -> Scene:
 
 
 @lru_cache(maxsize=4)
-def _sphere(width_px: int, height_px: int) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+def _sphere(width_px: int, height_px: int) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Direction and solid angle of every pixel of a panorama, in the panorama's frame."""
     azimuth = (0.5 - (np.arange(width_px) + 0.5) / width_px) * 2 * np.pi
     elevation = (0.5 - (np.arange(height_px) + 0.5) / height_px) * np.pi
@@ -217,7 +215,7 @@ def _sphere(width_px: int, height_px: int) -> tuple[Float[Array, "h w 3"], Float
     return directions, weights * (4 * np.pi / weights.sum())
 
 
-def _decode(path: str) -> Float[Array, "h w 3"]:
+def _decode(path: str) -> Float[np.ndarray, "h w 3"]:
     image = _read_exr(path) if path.lower().endswith(".exr") else cv2.imread(path, cv2.IMREAD_UNCHANGED)
     if image is None or image.ndim != 3 or image.shape[2] < 3 or image.dtype != np.float32:
         raise ConfigError(
@@ -234,7 +232,7 @@ def _decode(path: str) -> Float[Array, "h w 3"]:
     return np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=6e4, neginf=0.0), 0.0).astype(np.float32)
 
 
-def _read_exr(path: str) -> Float[Array, "h w 3"] | None:
+def _read_exr(path: str) -> Float[np.ndarray, "h w 3"] | None:
     try:
         with OpenEXR.File(path, separate_channels=True) as file:
             channels = {name.split(".")[-1]: np.asarray(c.pixels, np.float32) for name, c in file.channels().items()}

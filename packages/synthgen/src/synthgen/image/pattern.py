@@ -6,10 +6,8 @@ from jaxtyping import Float, UInt8
 from synthgen.image.sensor import display_from_linear, linear_from_display
 from synthgen.scene import Material, Pattern
 
-Array = np.ndarray
 
-
-def accent_weight(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array, " n"]:
+def accent_weight(pattern: Pattern, p_obj_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Weight of the accent colour at points in object coordinates, in [0, 1].
 
     Args:
@@ -21,7 +19,9 @@ def accent_weight(pattern: Pattern, p_obj_m: Float[Array, "n 3"]) -> Float[Array
     return np.clip(0.5 + 0.5 * pattern.sharpness * wave, 0.0, 1.0)
 
 
-def paint(rgb: UInt8[Array, "n 3"], material: Material, p_obj_m: Float[Array, "n 3"]) -> UInt8[Array, "n 3"]:
+def paint(
+    rgb: UInt8[np.ndarray, "n 3"], material: Material, p_obj_m: Float[np.ndarray, "n 3"]
+) -> UInt8[np.ndarray, "n 3"]:
     """Display colours of a lit surface with the material's base colour and pattern.
 
     Args:

@@ -8,19 +8,17 @@ from jaxtyping import Bool, Float
 from posecore.camera import Camera
 from posecore.window import Window
 
-Array = np.ndarray
-
 _REGION_MARGIN_PX = 3  # reach of interpolation and of the anti-aliasing blur beyond a crop window
 
 
-def inside_image(window: Window, patch_px: int, camera: Camera) -> Bool[Array, "p p"]:
+def inside_image(window: Window, patch_px: int, camera: Camera) -> Bool[np.ndarray, "p p"]:
     """Mask of the patch pixels inside the camera's image."""
     centres = (np.arange(patch_px) + 0.5) * (window.side_px / patch_px)
     x, y = window.x0_px + centres, window.y0_px + centres
     return ((y >= 0) & (y < camera.height_px))[:, None] & ((x >= 0) & (x < camera.width_px))[None, :]
 
 
-def contains(window: Window, box_px: Float[Array, "4"]) -> bool:
+def contains(window: Window, box_px: Float[np.ndarray, "4"]) -> bool:
     """Whether a box (x0, y0, x1, y1) lies wholly inside a window."""
     x0, y0, x1, y1 = box_px
     right, bottom = window.x0_px + window.side_px, window.y0_px + window.side_px

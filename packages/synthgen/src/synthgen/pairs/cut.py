@@ -28,7 +28,6 @@ from synthgen.image.region import inside_image
 from synthgen.pairs.cut_plan import AnnotatedImage, PairToCut, Plan
 from synthgen.pairs.pair_maker import limit_threads
 
-Array = np.ndarray
 _RIM = np.ones((3, 3), np.uint8)
 """Tolerance between a visible mask and the mesh's silhouette: one pixel."""
 
@@ -158,9 +157,9 @@ class _Layers:
         hidden: Occluded pixels of each object's silhouette, by position in the ground truth.
     """
 
-    rgb: Array
-    depth_m: Float[Array, "h w"]
-    hidden: Mapping[int, Bool[Array, "h w"]]
+    rgb: np.ndarray
+    depth_m: Float[np.ndarray, "h w"]
+    hidden: Mapping[int, Bool[np.ndarray, "h w"]]
 
 
 class _Patches:
@@ -172,7 +171,7 @@ class _Patches:
         self._rasteriser = rasteriser
         self._last: tuple[AnnotatedImage, _Layers] | None = None
 
-    def sample(self, image: AnnotatedImage, pair: PairToCut) -> dict[str, Array]:
+    def sample(self, image: AnnotatedImage, pair: PairToCut) -> dict[str, np.ndarray]:
         """Every field of the shard table."""
         if self._last is None or self._last[0] is not image:
             self._last = (image, self._layers(image))
@@ -228,7 +227,7 @@ class _Patches:
         in_pairs = {pair.gt.gt_index for pair in image.pairs}
         front, hidden = np.zeros((height, width), bool), {}
         for index, gt in enumerate(image.annotated):
-            stored = self._dataset.mask_and_place(scene_id, im_id, gt.gt_index, "mask_visib")
+            stored = self._dataset.mask_and_location(scene_id, im_id, gt.gt_index, "mask_visib")
             visible, file = (rendered.instance == index, "") if stored is None else stored
             if visible.shape != front.shape:
                 raise DatasetError(
@@ -244,7 +243,7 @@ class _Patches:
         return _Layers(rgb=rgb, depth_m=np.where(front, depth_m, np.float32(0)), hidden=hidden)
 
 
-def _hidden(amodal: Bool[Array, "h w"], visible: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+def _hidden(amodal: Bool[np.ndarray, "h w"], visible: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Occluded pixels of a silhouette, extended by a pixel beyond its rim.
 
     A patch's exact silhouette reaches beyond the image's pixels: its rim is hidden where the nearest pixels are. Lines

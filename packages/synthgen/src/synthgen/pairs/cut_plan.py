@@ -26,8 +26,7 @@ from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.draw.target import hull
 from synthgen.image.region import contains
 
-Array = np.ndarray
-Pose = Float[Array, "4 4"]
+Pose = Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +129,7 @@ class _PairSelector:
 
     def _fixed_windows(self, images: Sequence[AnnotatedImage]) -> dict[int, float]:
         """Window side of every object, large enough for its largest pose in the images (focal length over distance)."""
-        nearest: dict[int, tuple[float, Array, float]] = {}
+        nearest: dict[int, tuple[float, np.ndarray, float]] = {}
         for image in images:
             K = image.camera.K
             for gt in image.annotated:
@@ -191,7 +190,7 @@ class _PairSelector:
         return window
 
 
-def _hull_area_px(K: Float[Array, "3 3"], points_m: Float[Array, "h 3"]) -> float:
+def _hull_area_px(K: Float[np.ndarray, "3 3"], points_m: Float[np.ndarray, "h 3"]) -> float:
     """Area of a silhouette's convex hull."""
     return float(cv2.contourArea(cv2.convexHull(project(K, points_m).astype(np.float32))))
 
@@ -293,7 +292,7 @@ def _require_one_size(dataset: BopDataset, images: Sequence[AnnotatedImage], *, 
     if size[:2] != other[:2]:
         raise DatasetError(
             f"{dataset.split_path}: {where} is {size[0]} x {size[1]} pixels and {different} {other[0]} x {other[1]}, "
-            "expected images of one size; cut each size as a dataset of its own, or choose one with --sensor"
+            "expected images of equal size; cut each size as a dataset of its own, or choose one with --sensor"
         )
     raise DatasetError(
         f"{dataset.split_path}: {where} has fx {size[2]:g} and {different} {other[2]:g}, expected one focal length for "

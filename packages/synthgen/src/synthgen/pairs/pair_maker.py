@@ -38,8 +38,6 @@ from synthgen.image.region import (
 from synthgen.inputs.assets import Assets
 from synthgen.scene import Light, Scene, SceneObject
 
-Array = np.ndarray
-
 MAX_ATTEMPTS = 100
 MAX_HYPOTHESIS_ATTEMPTS = 50
 _VISIBILITY_PX = 64  # side of the low-resolution render that measures the visible fraction
@@ -59,12 +57,12 @@ class Hypothesis:
         rejected: Number of rejected draws before this one.
     """
 
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     window: Window
-    K_crop: Float[Array, "3 3"]
-    gt_depth_m: Float[Array, "p p"]
-    depth_m: Float[Array, "p p"]
-    rgb: UInt8[Array, "p p 3"]
+    K_crop: Float[np.ndarray, "3 3"]
+    gt_depth_m: Float[np.ndarray, "p p"]
+    depth_m: Float[np.ndarray, "p p"]
+    rgb: UInt8[np.ndarray, "p p 3"]
     rejected: int
 
 
@@ -80,7 +78,7 @@ class RenderedImage:
     """
 
     rendered: RenderedScene
-    image: UInt8[Array, "h w 3"]
+    image: UInt8[np.ndarray, "h w 3"]
     region_px: tuple[int, int, int, int]
     scale: float
 
@@ -122,7 +120,7 @@ class PairMaker:
             engine.close()
         self._rasteriser.close()
 
-    def samples(self, scene_index: int, keep: int | None = None, first_attempt: int = 0) -> dict[str, Array]:
+    def samples(self, scene_index: int, keep: int | None = None, first_attempt: int = 0) -> dict[str, np.ndarray]:
         """All samples of a scene: every field of the shard table, hypotheses on the first axis.
 
         Args:
@@ -189,10 +187,10 @@ class PairMaker:
         rendered = self._engines[self.config.engine].render(scene)
         return RenderedImage(rendered=rendered, image=compose(rendered, scene), region_px=region, scale=scale)
 
-    def _visible_fraction(self, box: Float[Array, "4"], draw: SceneDraw) -> float:
+    def _visible_fraction(self, box: Float[np.ndarray, "4"], draw: SceneDraw) -> float:
         return self._area_and_visibility(draw, box)[1]
 
-    def _area_and_visibility(self, draw: SceneDraw, box: Float[Array, "4"]) -> tuple[float, float]:
+    def _area_and_visibility(self, draw: SceneDraw, box: Float[np.ndarray, "4"]) -> tuple[float, float]:
         """The silhouette's area in patch pixels and its visible fraction, from a low-resolution render."""
         x0, y0, x1, y1 = box
         window = centred((x0 + x1) / 2, (y0 + y1) / 2, max(x1 - x0, y1 - y0))
@@ -219,7 +217,7 @@ class PairMaker:
         accepted: dict[int, Hypothesis] = {}
         attempts = dict.fromkeys(range(self.config.hypotheses_per_scene), 0)
         while len(accepted) < len(attempts):
-            candidates: dict[int, tuple[Float[Array, "4 4"], Window]] = {}
+            candidates: dict[int, tuple[Float[np.ndarray, "4 4"], Window]] = {}
             for number in attempts:
                 if number not in accepted:
                     candidate = self._next_candidate(draw, scene_index, number, attempts, tally)
@@ -237,7 +235,7 @@ class PairMaker:
 
     def _next_candidate(
         self, draw: SceneDraw, scene_index: int, number: int, attempts: dict[int, int], tally: Tally
-    ) -> tuple[Float[Array, "4 4"], Window] | None:
+    ) -> tuple[Float[np.ndarray, "4 4"], Window] | None:
         """The next draw of a hypothesis whose window contains both silhouettes' boxes, None after too many draws."""
         gt_box = target_box(draw.target, self.camera, draw.T_cam_obj)
         while attempts[number] < MAX_HYPOTHESIS_ATTEMPTS:
@@ -255,7 +253,7 @@ class PairMaker:
     def _rasterise(
         self,
         draw: SceneDraw,
-        candidates: Mapping[int, tuple[Float[Array, "4 4"], Window]],
+        candidates: Mapping[int, tuple[Float[np.ndarray, "4 4"], Window]],
         attempts: Mapping[int, int],
     ) -> dict[int, Hypothesis]:
         """Rasterise ground truth and hypotheses in their windows, at the patch's resolution."""
@@ -287,7 +285,7 @@ class PairMaker:
         hypothesis: Hypothesis,
         rejected_scenes: int,
         image: RenderedImage,
-    ) -> dict[str, Array]:
+    ) -> dict[str, np.ndarray]:
         config, window, p = self.config, hypothesis.window, self.config.patch_px
         local = window_in_region(scaled_window(window, image.scale), image.region_px)
         scene_depth_m, scene_mask = _scene_labels(
@@ -323,7 +321,7 @@ class PairMaker:
         }
         return {name: np.asarray(value) for name, value in values.items()}
 
-    def _hypothesis_rgb(self, draw: SceneDraw, hypothesis: Hypothesis) -> UInt8[Array, "p p 3"]:
+    def _hypothesis_rgb(self, draw: SceneDraw, hypothesis: Hypothesis) -> UInt8[np.ndarray, "p p 3"]:
         engine = self._engines.get(self.config.hypothesis_engine)
         if self.config.hypothesis_engine == "raster" or engine is None:
             return hypothesis.rgb
@@ -341,19 +339,19 @@ class PairMaker:
         return cut(image, window_in_region(hypothesis.window, region), self.config.patch_px, interpolation="area")
 
 
-def concatenate(scenes: Iterable[Mapping[str, Array]]) -> dict[str, Array]:
+def concatenate(scenes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """Join the samples of several scenes."""
     parts = list(scenes)
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def _scene_labels(
-    gt_depth_m: Float[Array, "p p"],
-    engine_depth_m: Float[Array, "p p"],
-    engine_index: Array,
-    inside: Bool[Array, "p p"],
+    gt_depth_m: Float[np.ndarray, "p p"],
+    engine_depth_m: Float[np.ndarray, "p p"],
+    engine_index: np.ndarray,
+    inside: Bool[np.ndarray, "p p"],
     reach_px: int,
-) -> tuple[Float[Array, "p p"], UInt8[Array, "p p"]]:
+) -> tuple[Float[np.ndarray, "p p"], UInt8[np.ndarray, "p p"]]:
     """Depth and mask bits of the scene patch.
 
     The object's silhouette and depth are exact at the patch's resolution; occlusion comes from the engine's layers,
