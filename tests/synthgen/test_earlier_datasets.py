@@ -4,6 +4,7 @@
 2 shards, and 2 whole images of 96 x 72 pixels.
 """
 
+import importlib
 import json
 import shutil
 from pathlib import Path
@@ -109,3 +110,9 @@ def test_its_images_are_continued(earlier):
     sources = Sources(objects=(EARLIER / "pairs/models/obj_000001.ply",))
     render_bop_dataset(BopJob(out=str(folder), plan=FramePlan(frames=2), config=config, sources=sources))
     assert json.loads((folder / "synthgen.json").read_text()) == before
+
+
+def test_modules_that_moved_are_refused_with_their_new_name():
+    for old, new in (("pair", "pairs.pair_maker"), ("run.lock", "lock"), ("blender.engine", "engines.blender")):
+        with pytest.raises(ImportError, match=f"is now synthgen.{new}$"):
+            importlib.import_module(f"synthgen.{old}")

@@ -13,8 +13,7 @@ from posecore.errors import ConfigError, ShardError
 from posecore.files import write_atomic
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
 
-Array = np.ndarray
-Image = UInt8[Array, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 
 CELL_PX = 256
 _CAPTION_PX = 22
@@ -76,7 +75,7 @@ def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> t
     return sheet.shape[1], sheet.shape[0]
 
 
-def sample_row(sample: Mapping[str, Array], index: int) -> Image:
+def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
     """Row of a contact sheet from the fields of a sample."""
     K = sample["K_crop"]
     scale = CELL_PX / sample["scene_rgb"].shape[0]
@@ -101,11 +100,11 @@ def sample_row(sample: Mapping[str, Array], index: int) -> Image:
     return np.concatenate([np.concatenate(cells, axis=1), _strip([caption], len(cells))])
 
 
-def _enlarge(image: Image) -> UInt8[Array, "cell cell 3"]:
+def _enlarge(image: Image) -> UInt8[np.ndarray, "cell cell 3"]:
     return np.asarray(cv2.resize(image, (CELL_PX, CELL_PX), interpolation=cv2.INTER_NEAREST))
 
 
-def _dots(image: Image, uv_px: Float[Array, "n 2"], colour: tuple[int, int, int]) -> Image:
+def _dots(image: Image, uv_px: Float[np.ndarray, "n 2"], colour: tuple[int, int, int]) -> Image:
     """Dots at continuous image coordinates; OpenCV has pixel centres at integers, in units of 1/16 px here."""
     image = np.ascontiguousarray(image)
     for u, v in np.rint((uv_px - 0.5) * 16).astype(int):
@@ -113,18 +112,18 @@ def _dots(image: Image, uv_px: Float[Array, "n 2"], colour: tuple[int, int, int]
     return image
 
 
-def _colour_mapped(values: Float[Array, "h w"], low: float, high: float) -> Image:
+def _colour_mapped(values: Float[np.ndarray, "h w"], low: float, high: float) -> Image:
     grey = (np.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)[..., ::-1])
 
 
-def _depth_colours(depth_m: Float[Array, "h w"]) -> Image:
+def _depth_colours(depth_m: Float[np.ndarray, "h w"]) -> Image:
     hit = depth_m > 0
     low, high = (float(depth_m[hit].min()), float(depth_m[hit].max())) if hit.any() else (0.0, 1.0)
     return np.where(hit[..., None], _colour_mapped(-depth_m, -high, -low), 0).astype(np.uint8)
 
 
-def _mask_colours(mask: UInt8[Array, "h w"]) -> Image:
+def _mask_colours(mask: UInt8[np.ndarray, "h w"]) -> Image:
     """Visible part white, hidden part red, other objects blue, the silhouette's contour green."""
     image = np.zeros((*mask.shape, 3), np.uint8)
     image[mask & BIT_FOREGROUND > 0] = (60, 90, 160)

@@ -18,8 +18,6 @@ from synthgen.pairs.data_card import create_writer
 from synthgen.run.render import RenderJob, shard_job
 from synthgen.run.shard_job import ShardJob, ShardRenderer
 
-Array = np.ndarray
-
 SUFFIXES = (".npz", ".png", ".jpg", ".jpeg")
 
 
@@ -39,7 +37,7 @@ class Reproduction:
     index: int
     scene: int
     hypothesis: int
-    sample: Mapping[str, Array]
+    sample: Mapping[str, np.ndarray]
     differences: tuple[str, ...] | None
     absent: str = ""
 
@@ -119,7 +117,7 @@ def check_suffix(file: Path) -> None:
         raise ConfigError(f"--save {file}: expected a file that ends in {', '.join(SUFFIXES)}")
 
 
-def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, Array] | None, str, frozenset[int]]:
+def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, np.ndarray] | None, str, frozenset[int]]:
     """The stored shard or the reason for none, and its quarantined scenes."""
     if open_store(url).get(GROUP) is None:
         return None, f"there is no dataset at {url}", frozenset()
@@ -131,7 +129,7 @@ def _stored(url: str, job: ShardJob, shard_id: int) -> tuple[dict[str, Array] | 
     return reader.read(shard_id), "", frozenset(line.get("quarantined", ()))
 
 
-def _as_stored(job: ShardJob, fields: Mapping[str, Array]) -> dict[str, Array]:
+def _as_stored(job: ShardJob, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """A sample as read from a shard: after the same quantisation and codecs."""
     card = {**job.card, "n": 1, "shard_size": 1}
     with TemporaryDirectory() as folder:
@@ -141,7 +139,7 @@ def _as_stored(job: ShardJob, fields: Mapping[str, Array]) -> dict[str, Array]:
     return {name: np.asarray(value[0]) for name, value in values.items()}
 
 
-def _difference(name: str, stored: Array, made: Array) -> str:
+def _difference(name: str, stored: np.ndarray, made: np.ndarray) -> str:
     """Difference of a field in words, empty for equal bits."""
     if stored.shape == made.shape and stored.dtype == made.dtype and stored.tobytes() == made.tobytes():
         return ""

@@ -22,7 +22,6 @@ from posecore.shard import Field, ShardReader, field_table, n_shards
 
 from synthgen.machine import free_bytes
 
-Array = np.ndarray
 OnShard = Callable[[int], None]
 Layout = Literal["hdf5", "webdataset"]
 
@@ -151,7 +150,7 @@ def to_webdataset(url: str, out: Path, *, overwrite: bool = False, on_shard: OnS
             on_shard(reader.n_samples(shard_id))
 
 
-def webdataset_files(sample: Mapping[str, Array], card: Mapping[str, Any]) -> dict[str, bytes]:
+def webdataset_files(sample: Mapping[str, np.ndarray], card: Mapping[str, Any]) -> dict[str, bytes]:
     """Files of a sample by the suffix after its key."""
     table = {field.name: field for field in field_table()}
     files = {f"{name}.png": _png(table[name], sample[name], card) for name in PNG_FIELDS}
@@ -176,14 +175,14 @@ def _hdf5_dataset(file: h5py.File, field: Field, card: Mapping[str, Any]) -> Non
     made.attrs["unit"], made.attrs["text"] = field.unit, field.text
 
 
-def _png(field: Field, values: Array, card: Mapping[str, Any]) -> bytes:
+def _png(field: Field, values: np.ndarray, card: Mapping[str, Any]) -> bytes:
     stored = field.encode(values, card)
     ok, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored, _PNG)
     assert ok
     return data.tobytes()
 
 
-def _npz(arrays: Mapping[str, Array]) -> bytes:
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Bytes as of np.savez_compressed, but faster and without timestamps."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -232,7 +231,7 @@ def model_keys(reader: ShardReader) -> list[str]:
     return keys
 
 
-def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, Array]]]:
+def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     for shard_id in reader.committed:
         yield shard_id, reader.read(shard_id)
 

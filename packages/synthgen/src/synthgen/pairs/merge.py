@@ -14,7 +14,6 @@ from synthgen import lock
 from synthgen.pairs.data_card import create_writer
 from synthgen.pairs.export import complete_dataset, model_keys
 
-Array = np.ndarray
 MODELS_INFO = "models/models_info.json"
 _SAME = ("schema", "schema_version", "patch_px", "contour_points", "units")
 _CAMERA = ("width_px", "height_px", "fx", "fy", "cx", "cy")
@@ -205,14 +204,14 @@ class _Rows:
             scenes[source] = max(scenes.get(source, 0), last + 1)
         first = dict(zip(scenes, np.cumsum([0, *scenes.values()]).tolist(), strict=False))
         self._scenes = [first[source] for source in sources]
-        self._last: tuple[tuple[int, int], dict[str, Array]] | None = None
+        self._last: tuple[tuple[int, int], dict[str, np.ndarray]] | None = None
 
-    def between(self, start: int, end: int) -> dict[str, Array]:
+    def between(self, start: int, end: int) -> dict[str, np.ndarray]:
         """Every field of the rows from `start` to `end`, exclusive."""
         pieces = list(self._pieces(start, end))
         return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
 
-    def _pieces(self, start: int, end: int) -> Iterator[Mapping[str, Array]]:
+    def _pieces(self, start: int, end: int) -> Iterator[Mapping[str, np.ndarray]]:
         for number, part in enumerate(self._parts):
             low, high = max(start, self._first[number]), min(end, self._first[number + 1])
             row = low - self._first[number]
@@ -223,7 +222,7 @@ class _Rows:
                 yield {name: rows[offset : offset + count] for name, rows in values.items()}
                 low, row = low + count, row + count
 
-    def _shard(self, number: int, shard_id: int) -> dict[str, Array]:
+    def _shard(self, number: int, shard_id: int) -> dict[str, np.ndarray]:
         if self._last is None or self._last[0] != (number, shard_id):
             values = self._parts[number].read(shard_id)
             values["scene_index"] = values["scene_index"] + self._scenes[number]

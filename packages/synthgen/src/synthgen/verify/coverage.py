@@ -9,12 +9,11 @@ from jaxtyping import Float, Int
 from synthgen.verify.facts import Facts, SampleBatch
 from synthgen.verify.pose_checks import centres_cam_m, perturbation_deg, translation_diameters
 
-Array = np.ndarray
-Coverage = Mapping[str, Array]
+Coverage = Mapping[str, np.ndarray]
 """Numbers by name, one row a sample."""
 
 
-def measure_coverage(batch: SampleBatch) -> dict[str, Array]:
+def measure_coverage(batch: SampleBatch) -> dict[str, np.ndarray]:
     """Coverage numbers of each sample.
 
     Returns:
@@ -50,18 +49,18 @@ def measure_coverage(batch: SampleBatch) -> dict[str, Array]:
     }
 
 
-def joined(parts: Sequence[Coverage]) -> dict[str, Array]:
+def joined(parts: Sequence[Coverage]) -> dict[str, np.ndarray]:
     """Rows of several shards after one another."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
-def by_scene(coverage: Coverage) -> dict[str, Array]:
+def by_scene(coverage: Coverage) -> dict[str, np.ndarray]:
     """The first sample of each object in each scene, for numbers of the ground truth."""
     _, first = np.unique(np.stack([coverage["scene"], coverage["obj_id"]]), axis=1, return_index=True)
     return {name: values[first] for name, values in coverage.items()}
 
 
-def lambert_xy(direction: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+def lambert_xy(direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Lambert's azimuthal equal-area map of unit directions, each hemisphere around its own pole.
 
     The pole (z = +1 or -1) is at (0, 0), the equator at radius 1; equal areas on the sphere stay equal. Azimuth runs
@@ -77,7 +76,7 @@ def sectors_in(ring: Any) -> Any:
     return 3 * (2 * ring + 1)
 
 
-def view_counts(view: Float[Array, "n 3"], rings: int) -> tuple[Int[Array, " c"], Int[Array, " c"]]:
+def view_counts(view: Float[np.ndarray, "n 3"], rings: int) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
     """Directions in each cell of the two hemispheres' maps, (upper, lower).
 
     Ring k lies between the radii k / rings and (k + 1) / rings and is cut into `sectors_in(k)` cells from +x on,

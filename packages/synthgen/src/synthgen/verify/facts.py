@@ -17,8 +17,6 @@ from posecore.shard import BIT_OBJECT, ShardReader, field_table, load_meshes
 from synthgen.draw.target import hull
 from synthgen.pairs.data_card import migrated_card
 
-Array = np.ndarray
-
 _REQUIRED = {  # keys of the configuration that checks compare samples with
     "": ("hypotheses_per_scene", "hypothesis_engine"),
     "distance": ("unit", "min", "max"),
@@ -41,7 +39,7 @@ class Facts:
 
     card: Mapping[str, Any]
     meshes: Mapping[int, Mesh]
-    hulls_m: Mapping[int, Array]
+    hulls_m: Mapping[int, np.ndarray]
     camera: Camera
 
     @property
@@ -70,12 +68,12 @@ class Facts:
         step = next(f for f in field_table() if f.name == field).step(self.card)
         return float(np.finfo(np.float32).eps) if step is None else step
 
-    def object_values(self, obj_id: Int[Array, " n"], key: str) -> Float[Array, " n"]:
+    def object_values(self, obj_id: Int[np.ndarray, " n"], key: str) -> Float[np.ndarray, " n"]:
         """A number of each sample's object from the card; NaN for an object that is not in the card."""
         objects = self.card["objects"]
         return np.array([float(objects.get(str(i), {}).get(key, np.nan)) for i in obj_id.tolist()])
 
-    def centres_m(self, obj_id: Int[Array, " n"]) -> Float[Array, "n 3"]:
+    def centres_m(self, obj_id: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
         """Box centre of each sample's object, object frame, metres; NaN for an object that is not in the card."""
         unknown = np.full(3, np.nan)
         return np.array([self.meshes[i].center_m if i in self.meshes else unknown for i in obj_id.tolist()])
@@ -123,50 +121,54 @@ class SampleBatch:
     """
 
     def __init__(
-        self, values: Mapping[str, Array], indices: Int[Array, " n"], facts: Facts, rasteriser: Rasteriser | None = None
+        self,
+        values: Mapping[str, np.ndarray],
+        indices: Int[np.ndarray, " n"],
+        facts: Facts,
+        rasteriser: Rasteriser | None = None,
     ) -> None:
         self.values = values
         self.indices = indices
         self.facts = facts
         self._rasteriser = rasteriser
 
-    def __getitem__(self, name: str) -> Array:
+    def __getitem__(self, name: str) -> np.ndarray:
         return self.values[name]
 
     def __len__(self) -> int:
         return len(self.indices)
 
     @cached_property
-    def object_mask(self) -> Bool[Array, "n p p"]:
+    def object_mask(self) -> Bool[np.ndarray, "n p p"]:
         """Stored whole silhouettes at the ground truth."""
         return np.asarray(self["scene_mask"] & BIT_OBJECT > 0)
 
     @cached_property
-    def hypothesis_mask(self) -> Bool[Array, "n p p"]:
+    def hypothesis_mask(self) -> Bool[np.ndarray, "n p p"]:
         """Stored silhouettes at the hypothesis."""
         return np.asarray(self["hypothesis_depth_m"] > 0)
 
     @cached_property
-    def scene_contour(self) -> Bool[Array, "n p p"]:
+    def scene_contour(self) -> Bool[np.ndarray, "n p p"]:
         """Contour pixels of the stored silhouettes at the ground truth."""
         return np.stack([contour_mask(mask) for mask in self.object_mask])
 
     @cached_property
-    def hypothesis_contour(self) -> Bool[Array, "n p p"]:
+    def hypothesis_contour(self) -> Bool[np.ndarray, "n p p"]:
         """Contour pixels of the stored silhouettes at the hypothesis."""
         return np.stack([contour_mask(mask) for mask in self.hypothesis_mask])
 
     @cached_property
-    def gt_rendered_m(self) -> Float[Array, "n p p"]:
+    def gt_rendered_m(self) -> Float[np.ndarray, "n p p"]:
         """Camera z of the objects rendered at the ground truth, 0 for background."""
         return self._render("T_cam_obj")
 
     @cached_property
-    def hypothesis_rendered_m(self) -> Float[Array, "n p p"]:
+    def hypothesis_rendered_m(self) -> Float[np.ndarray, "n p p"]:
         """Camera z of the objects rendered at the hypothesis, 0 for background."""
         return self._render("T_cam_obj_hypothesis")
 
-    def _render(self, pose: str) -> Float[Array, "n p p"]:
+    def _render(self, pose: str) -> Float[np.ndarray, "n p p"]:
         if self._rasteriser is None:
             raise RenderError("this batch has no rasteriser, so nothing can be rendered again")
         p = self.facts.patch_px

@@ -15,8 +15,6 @@ from synthgen.verify import plots
 from synthgen.verify.coverage import by_scene, view_counts
 from synthgen.verify.findings import Finding, VerificationReport
 
-Array = np.ndarray
-
 SHOWN = 6  # samples of each contact sheet
 _PER_CELL = 8  # scenes a cell of the sphere for a uniform distribution of views
 
@@ -165,7 +163,7 @@ def _ranges(report: VerificationReport) -> dict[str, tuple[float, float]]:
     }
 
 
-def _rejected(draws: Array) -> str:
+def _rejected(draws: np.ndarray) -> str:
     title, label = "Rejected draws before a sample", "draws"
     if int(draws.max()) < 24:
         return plots.bars(title, label, {str(i): int((draws == i).sum()) for i in range(int(draws.max()) + 1)})

@@ -12,14 +12,12 @@ from synthgen.verify.check import CheckList
 from synthgen.verify.facts import SampleBatch
 from synthgen.verify.pose_checks import as_window
 
-Array = np.ndarray
-
 _RIM = np.ones((5, 5), np.uint8)
 CHECKS = CheckList()
 
 
 @CHECKS.register("scene patch", 0, "flag", "sensor noise alone makes more than half a grey level")
-def scene_patch(batch: SampleBatch) -> Float[Array, " n"]:
+def scene_patch(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The scene patch is not blank: its grey levels differ by more than 0.5 (standard deviation)."""
     flat = batch["scene_rgb"].reshape(len(batch), -1)
     return np.array([float(cv2.meanStdDev(row)[1].item() <= 0.5) for row in flat])
@@ -28,7 +26,7 @@ def scene_patch(batch: SampleBatch) -> Float[Array, " n"]:
 @CHECKS.register(
     "hypothesis patch", 0, "pixels", "the silhouette is the render's own; 2 px more where an engine anti-aliases"
 )
-def hypothesis_patch(batch: SampleBatch) -> Float[Array, " n"]:
+def hypothesis_patch(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The hypothesis patch shows something inside its silhouette and is black outside."""
     exact = not batch.facts.rendered or batch.facts.card["config"]["hypothesis_engine"] == "raster"
     count = np.zeros(len(batch))
@@ -40,7 +38,7 @@ def hypothesis_patch(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("mask", 0, "pixels", "bits are exact")
-def mask(batch: SampleBatch) -> Float[Array, " n"]:
+def mask(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Visible pixels are object and foreground, foreground has depth and nothing else has, no other bit is set."""
     bits, depth = batch["scene_mask"], batch["scene_depth_m"] > 0
     visible, whole, front = bits & BIT_VISIBLE > 0, bits & BIT_OBJECT > 0, bits & BIT_FOREGROUND > 0
@@ -51,7 +49,7 @@ def mask(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("outside", 0, "pixels", "whether a patch pixel's centre lies in the image is exact")
-def outside(batch: SampleBatch) -> Float[Array, " n"]:
+def outside(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Nothing is visible outside the camera's image, where the scene patch is black but for its outermost pixels."""
     count = np.zeros(len(batch))
     for i, values in enumerate(batch["window_px"]):
@@ -69,7 +67,7 @@ def outside(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("visible fraction", 1e-6, "1", "one division of whole numbers, stored in float32")
-def visible_fraction(batch: SampleBatch) -> Float[Array, " n"]:
+def visible_fraction(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """visible_fraction is the mask's visible pixels over its object pixels."""
     visible = (batch["scene_mask"] & BIT_VISIBLE > 0).sum(axis=(1, 2))
     whole = batch.object_mask.sum(axis=(1, 2))

@@ -9,8 +9,6 @@ from jaxtyping import Float, Int
 
 from synthgen.verify.coverage import sectors_in
 
-Array = np.ndarray
-
 WIDTH, HEIGHT = 460, 250
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 12, 46
 BAR = "#1f5fd0"
@@ -18,7 +16,9 @@ EMPTY = "#d9730d"
 _LOW, _HIGH = np.array([226.0, 236.0, 250.0]), np.array([12.0, 52.0, 130.0])  # few to many samples
 
 
-def histogram(title: str, x_label: str, values: Float[Array, " n"], low: float, high: float, bins: int = 24) -> str:
+def histogram(
+    title: str, x_label: str, values: Float[np.ndarray, " n"], low: float, high: float, bins: int = 24
+) -> str:
     """Fractions of samples by value; the axis' label counts values outside [low, high]."""
     high = high if high > low else low + 1.0
     finite = values[np.isfinite(values)]
@@ -39,7 +39,7 @@ def bars(title: str, x_label: str, counts: Mapping[str, int]) -> str:
 
 
 def _figure(
-    title: str, x_label: str, counts: Int[Array, " b"], names: Sequence[str], ticks: Sequence[tuple[float, str]]
+    title: str, x_label: str, counts: Int[np.ndarray, " b"], names: Sequence[str], ticks: Sequence[tuple[float, str]]
 ) -> str:
     total, top = max(1, int(counts.sum())), max(1, int(counts.max(initial=0)))
     across, down = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
@@ -70,7 +70,7 @@ def _figure(
     )
 
 
-def sphere_maps(upper: Int[Array, " c"], lower: Int[Array, " c"], rings: int) -> str:
+def sphere_maps(upper: Int[np.ndarray, " c"], lower: Int[np.ndarray, " c"], rings: int) -> str:
     """Camera directions in the object's frame: both hemispheres on equal-area maps, coloured by the number of scenes.
 
     Args:
@@ -118,7 +118,9 @@ def _cell(ring: int, sector: int, width: float) -> str:
     return start + (f"A{inner:.2f} {inner:.2f} 0 0 1 {point(inner, a)}Z" if inner else "Z")
 
 
-def position_map(u: Float[Array, " n"], v: Float[Array, " n"], width_px: int, height_px: int, cells: int = 24) -> str:
+def position_map(
+    u: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], width_px: int, height_px: int, cells: int = 24
+) -> str:
     """Positions of the window centres in the image, with a margin for centres outside."""
     edges = np.linspace(-0.25, 1.25, cells + 1).tolist()
     finite = np.isfinite(u) & np.isfinite(v)

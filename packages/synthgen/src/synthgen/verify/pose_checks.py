@@ -10,13 +10,11 @@ from synthgen.pairs.pair_maker import MAX_ATTEMPTS, MAX_HYPOTHESIS_ATTEMPTS
 from synthgen.verify.check import CheckList
 from synthgen.verify.facts import SampleBatch
 
-Array = np.ndarray
-
 CHECKS = CheckList()
 
 
 @CHECKS.register("finite", 0, "values", "NaN and infinity have no meaning in any field")
-def finite(batch: SampleBatch) -> Float[Array, " n"]:
+def finite(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """No field holds NaN or infinity."""
     bad = np.zeros(len(batch))
     for values in batch.values.values():
@@ -26,7 +24,7 @@ def finite(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("poses", 1e-9, "1", "poses are stored in float64 as they were drawn; products of rotations lose 1e-15")
-def poses(batch: SampleBatch) -> Float[Array, " n"]:
+def poses(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Both poses are rigid: R R^T = I, det R = +1, last row 0 0 0 1."""
     worst = np.zeros(len(batch))
     for name in ("T_cam_obj", "T_cam_obj_hypothesis"):
@@ -39,7 +37,7 @@ def poses(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("camera", 1e-6, "px", "float64 throughout; the card holds the intrinsics of the render")
-def camera(batch: SampleBatch) -> Float[Array, " n"]:
+def camera(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """K is the card's camera where all images share it, and K_crop is K cut to window_px."""
     K, windows = batch["K"], batch["window_px"]
     shared = batch.facts.card["camera"].get("shared", True)
@@ -54,13 +52,13 @@ def camera(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("object", 0, "flag", "an object id is an integer")
-def listed_object(batch: SampleBatch) -> Float[Array, " n"]:
+def listed_object(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """obj_id is an object of the data card."""
     return np.array([float(i not in batch.facts.meshes) for i in batch["obj_id"].tolist()])
 
 
 @CHECKS.register("window", 1e-3, "px", "the box is projected from models/, whose millimetres are float32")
-def window(batch: SampleBatch) -> Float[Array, " n"]:
+def window(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The window has the object's fixed side or follows its distance, and is centred on the hypothesis' box."""
     side_px = batch.facts.object_values(batch["obj_id"], "window_side_px")
     scale = batch.facts.diameter_scale
@@ -81,7 +79,7 @@ def window(batch: SampleBatch) -> Float[Array, " n"]:
 @CHECKS.register(
     "distance", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32", rendered=True
 )
-def distance(batch: SampleBatch) -> Float[Array, " n"]:
+def distance(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Camera z of the box centre at the ground truth lies in the configured range."""
     distance = batch.facts.card["config"]["distance"]
     diameter_m = batch.facts.object_values(batch["obj_id"], "diameter_m")
@@ -93,7 +91,7 @@ def distance(batch: SampleBatch) -> Float[Array, " n"]:
 @CHECKS.register(
     "angle", 1e-6, "deg", "float64 throughout; the angle of two rotations is exact to 1e-8 rad", rendered=True
 )
-def angle(batch: SampleBatch) -> Float[Array, " n"]:
+def angle(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Rotation between ground truth and hypothesis is at most perturbation.max_angle_deg."""
     limit = batch.facts.card["config"]["perturbation"]["max_angle_deg"]
     return (perturbation_deg(batch) - limit).clip(0)
@@ -102,14 +100,14 @@ def angle(batch: SampleBatch) -> Float[Array, " n"]:
 @CHECKS.register(
     "translation", 1e-6, "diameters", "the box centre comes from models/, whose millimetres are float32", rendered=True
 )
-def translation(batch: SampleBatch) -> Float[Array, " n"]:
+def translation(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Box centres at ground truth and hypothesis are at most perturbation.max_translation_diameter apart."""
     limit = batch.facts.card["config"]["perturbation"]["max_translation_diameter"]
     return (translation_diameters(batch) - limit).clip(0)
 
 
 @CHECKS.register("scene", 0, "flag", "all samples of a scene store the same pose", rendered=True)
-def scene(batch: SampleBatch) -> Float[Array, " n"]:
+def scene(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """scene_index is the sample's index over the hypotheses per scene; a scene's samples have one object and pose."""
     per_scene = batch.facts.hypotheses_per_scene
     wrong = batch["scene_index"] != batch.indices // per_scene
@@ -119,30 +117,30 @@ def scene(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 @CHECKS.register("rejected", 0, "flag", "more draws than the sampler makes cannot have been rejected")
-def rejected(batch: SampleBatch) -> Float[Array, " n"]:
+def rejected(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The number of rejected draws is within the sampler's limits."""
     count = batch["rejected"]
     return np.asarray((count < 0) | (count > MAX_ATTEMPTS + MAX_HYPOTHESIS_ATTEMPTS)).astype(np.float64)
 
 
-def centres_cam_m(batch: SampleBatch, pose: str) -> Float[Array, "n 3"]:
+def centres_cam_m(batch: SampleBatch, pose: str) -> Float[np.ndarray, "n 3"]:
     """Box centres of the objects in the camera frame at a pose, metres; NaN for objects that are not in the card."""
     T = batch[pose]
     return np.einsum("nij,nj->ni", T[:, :3, :3], batch.facts.centres_m(batch["obj_id"])) + T[:, :3, 3]
 
 
-def perturbation_deg(batch: SampleBatch) -> Float[Array, " n"]:
+def perturbation_deg(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Rotation angle between ground truth and hypothesis, degrees."""
     R = batch["T_cam_obj_hypothesis"][:, :3, :3] @ np.swapaxes(batch["T_cam_obj"][:, :3, :3], 1, 2)
     return np.rad2deg(se3.rotation_angle_rad(R))
 
 
-def translation_diameters(batch: SampleBatch) -> Float[Array, " n"]:
+def translation_diameters(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Distance between the box centres at ground truth and hypothesis, diameters."""
     shift_m = centres_cam_m(batch, "T_cam_obj_hypothesis") - centres_cam_m(batch, "T_cam_obj")
     return np.linalg.norm(shift_m, axis=1) / batch.facts.object_values(batch["obj_id"], "diameter_m")
 
 
-def as_window(values: Float[Array, "3"]) -> Window:
+def as_window(values: Float[np.ndarray, "3"]) -> Window:
     """The window of a stored `window_px`: x0, y0 and side, pixels."""
     return Window(x0_px=float(values[0]), y0_px=float(values[1]), side_px=float(values[2]))

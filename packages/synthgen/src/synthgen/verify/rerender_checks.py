@@ -11,8 +11,6 @@ from synthgen.verify.check import CheckList
 from synthgen.verify.contour_checks import depth_error_m
 from synthgen.verify.facts import SampleBatch
 
-Array = np.ndarray
-
 _RIM = np.ones((5, 5), np.uint8)
 _FREE_PX = 2
 _VERTICES = 2000  # of each object that are projected
@@ -22,7 +20,7 @@ CHECKS = CheckList()
 @CHECKS.register(
     "vertices", 0.02, "fraction of vertices", "parts thinner than a pixel may have no mask pixel", rerendered=True
 )
-def vertices(batch: SampleBatch) -> Float[Array, " n"]:
+def vertices(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The mesh's vertices, projected without a renderer, fall into both silhouettes, within 2 pixels."""
     fraction = np.full(len(batch), np.inf)
     for i, obj_id in enumerate(batch["obj_id"].tolist()):
@@ -41,33 +39,33 @@ _OTHER_GL = "2 pixels are free: the pixels that an edge covers depend on the GL 
 
 
 @CHECKS.register("ground truth re-rendered", 0.05, "fraction of the contour", _OTHER_GL, rerendered=True)
-def ground_truth_silhouette(batch: SampleBatch) -> Float[Array, " n"]:
+def ground_truth_silhouette(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The object's mask bit is the mesh's silhouette at the ground truth (differing over contour pixels)."""
     return _silhouette_difference(batch.object_mask, batch.gt_rendered_m > 0, batch.scene_contour)
 
 
 @CHECKS.register("hypothesis re-rendered", 0.05, "fraction of the contour", _OTHER_GL, rerendered=True)
-def hypothesis_silhouette(batch: SampleBatch) -> Float[Array, " n"]:
+def hypothesis_silhouette(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """The hypothesis' depth has the silhouette of the mesh rendered at the hypothesis."""
     return _silhouette_difference(batch.hypothesis_mask, batch.hypothesis_rendered_m > 0, batch.hypothesis_contour)
 
 
 @CHECKS.register("scene depth re-rendered", 0.01, "fraction of pixels", _OTHER_GL, rerendered=True)
-def scene_depth(batch: SampleBatch) -> Float[Array, " n"]:
+def scene_depth(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Where the object is visible, scene depth is the rendered depth within one step."""
     visible = (batch["scene_mask"] & BIT_VISIBLE > 0) & (batch.gt_rendered_m > 0)
     return _depth_difference(batch, "scene_depth_m", batch.gt_rendered_m, visible)
 
 
 @CHECKS.register("hypothesis depth re-rendered", 0.01, "fraction of pixels", _OTHER_GL, rerendered=True)
-def hypothesis_depth(batch: SampleBatch) -> Float[Array, " n"]:
+def hypothesis_depth(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Hypothesis depth is the rendered depth within one step."""
     both = batch.hypothesis_mask & (batch.hypothesis_rendered_m > 0)
     return _depth_difference(batch, "hypothesis_depth_m", batch.hypothesis_rendered_m, both)
 
 
 @CHECKS.register("contour on surface", 0.1, "fraction of points", _OTHER_GL, rerendered=True)
-def contour_on_surface(batch: SampleBatch) -> Float[Array, " n"]:
+def contour_on_surface(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     """Contour points lie on the rendered surface within one depth step, hidden ones too."""
     limit_m = 1.01 * batch.facts.step("hypothesis_depth_m")
     fractions = []
@@ -82,7 +80,10 @@ def contour_on_surface(batch: SampleBatch) -> Float[Array, " n"]:
 
 
 def _stray_fraction(
-    points_m: Float[Array, "v 3"], T_cam_obj: Float[Array, "4 4"], K: Float[Array, "3 3"], mask: Bool[Array, "p p"]
+    points_m: Float[np.ndarray, "v 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    K: Float[np.ndarray, "3 3"],
+    mask: Bool[np.ndarray, "p p"],
 ) -> float:
     """Fraction of vertices that project into the patch but outside the silhouette."""
     uv = np.nan_to_num(np.floor(project(K, se3.apply(T_cam_obj, points_m))), nan=-1, posinf=-1, neginf=-1)
@@ -92,13 +93,13 @@ def _stray_fraction(
 
 
 def _silhouette_difference(
-    stored: Bool[Array, "n p p"], rendered: Bool[Array, "n p p"], contour: Bool[Array, "n p p"]
-) -> Float[Array, " n"]:
+    stored: Bool[np.ndarray, "n p p"], rendered: Bool[np.ndarray, "n p p"], contour: Bool[np.ndarray, "n p p"]
+) -> Float[np.ndarray, " n"]:
     return ((stored != rendered).sum(axis=(1, 2)) - _FREE_PX).clip(0) / contour.sum(axis=(1, 2)).clip(1)
 
 
 def _depth_difference(
-    batch: SampleBatch, name: str, rendered_m: Float[Array, "n p p"], where: Bool[Array, "n p p"]
-) -> Float[Array, " n"]:
+    batch: SampleBatch, name: str, rendered_m: Float[np.ndarray, "n p p"], where: Bool[np.ndarray, "n p p"]
+) -> Float[np.ndarray, " n"]:
     unequal = where & (np.abs(batch[name] - rendered_m) > 1.01 * batch.facts.step(name))
     return (unequal.sum(axis=(1, 2)) - _FREE_PX).clip(0) / where.sum(axis=(1, 2)).clip(1)

@@ -20,8 +20,6 @@ from synthgen.verify.coverage import Coverage, joined, measure_coverage
 from synthgen.verify.facts import Facts, SampleBatch, load_facts
 from synthgen.verify.findings import FIRST, Finding, VerificationReport, dataset_finding, tolerance_text
 
-Array = np.ndarray
-
 DEFAULT_SAMPLES = 5000
 
 
@@ -33,7 +31,7 @@ class ShardResult:
     n: int
     damage: str | None = None
     line_is_right: bool = True
-    measured: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    measured: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     hashes: tuple[bytes, ...] = ()
     coverage: Coverage = field(default_factory=dict)
     gl: str | None = None
@@ -261,7 +259,7 @@ def _duplicates(results: Sequence[ShardResult], shard_size: int) -> Finding:
     return dataset_finding("duplicates", "samples", sum(len(r.hashes) for r in results), twice)
 
 
-def _hash(values: dict[str, Array], i: int) -> bytes:
+def _hash(values: dict[str, np.ndarray], i: int) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for name in ("T_cam_obj", "T_cam_obj_hypothesis", "scene_rgb"):
         digest.update(values[name][i].tobytes())
