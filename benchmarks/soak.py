@@ -5,9 +5,9 @@
 
 A first dataset is rendered without faults. Then others of the same settings are rendered while workers and the command
 itself are killed with `kill -9` at random, the disk is full, the folder turns read-only, files of the dataset are lost
-or truncated, a second command writes into the same folder, and a folder of objects holds one that cannot be loaded. Each must end
-with the files of the first, by SHA-256. Disk full and read-only need a tmpfs, so root; otherwise they are skipped and
-reported. The last line is JSON; the exit code is 0 when nothing was lost.
+or truncated, a second command writes into the same folder, and a folder of objects holds one that cannot be loaded.
+Each must end with the files of the first, by SHA-256. Disk full and read-only need a tmpfs, so root; otherwise they are
+skipped and reported. The last line is JSON; the exit code is 0 when nothing was lost.
 """
 
 import argparse
