@@ -1,4 +1,4 @@
-"""What noise costs: time and error of a Cycles scene by light paths per pixel, with and without Blender's denoiser.
+"""Noise against time: error of a Cycles scene by light paths per pixel, with and without Blender's denoiser.
 
     python benchmarks/render_noise.py --scenes 8
 
@@ -45,15 +45,15 @@ def main() -> None:
     engine = maker._engines["cycles"]
     render, scenes = engine.render, []
 
-    def kept(scene: Scene) -> RenderedScene:
+    def recorded(scene: Scene) -> RenderedScene:
         scenes.append(scene)
         return render(scene)
 
-    engine.render = kept  # type: ignore[method-assign]
+    engine.render = recorded  # type: ignore[method-assign]
     for index in range(arguments.scenes):
         maker.samples(index)
     settings = engine._scene.cycles  # type: ignore[attr-defined]
-    truth = [display(render(replace(s, samples=REFERENCE_SAMPLES, render_seed=s.render_seed ^ 1))) for s in scenes]
+    references = [display(render(replace(s, samples=REFERENCE_SAMPLES, render_seed=s.render_seed ^ 1))) for s in scenes]
     rows = []
     for denoiser, quality in DENOISERS.items():
         settings.use_denoising = quality is not None
@@ -61,16 +61,16 @@ def main() -> None:
             settings.denoiser, settings.denoising_quality = "OPENIMAGEDENOISE", quality
             settings.denoising_input_passes, settings.denoising_prefilter = "RGB", "NONE"
         for samples in arguments.samples:
-            wanted = [replace(s, samples=samples) for s in scenes]
-            render(wanted[0])
+            noisy = [replace(s, samples=samples) for s in scenes]
+            render(noisy[0])
             took_s, errors = [], []
             for _ in range(arguments.rounds):
                 began = time.perf_counter()
-                images = [render(s) for s in wanted]
-                took_s.append((time.perf_counter() - began) / len(wanted))
-            for image, best in zip(images, truth, strict=True):
+                images = [render(s) for s in noisy]
+                took_s.append((time.perf_counter() - began) / len(noisy))
+            for image, reference in zip(images, references, strict=True):
                 covered = image.alpha > 0
-                errors.append(float(np.sqrt(np.mean((display(image) - best)[covered] ** 2))))
+                errors.append(float(np.sqrt(np.mean((display(image) - reference)[covered] ** 2))))
             row = {"denoiser": denoiser, "samples": samples, "ms": round(1e3 * statistics.median(took_s), 1)}
             rows.append(row | {"rms_levels": round(statistics.mean(errors), 2)})
             print(

@@ -1,11 +1,11 @@
-"""Pairs a second of `synthgen render`, where the time of a pair goes, whether it stays flat, and a peer beside it.
+"""Throughput of `synthgen render`, time of a pair by stage, constancy over a long run, and a comparison with a peer.
 
     python benchmarks/render_throughput.py --engine raster
     python benchmarks/render_throughput.py --engine cycles --flat-scenes 2500
     python benchmarks/render_throughput.py --engine cycles --blenderproc DIR --blenderproc-python PYTHON --rounds 3
 
-Throughput is measured on the real command with all its workers, from the first shard on disk to the last. Stages are
-measured in this process, one worker's work on one core. With `--blenderproc` (a source checkout of BlenderProc and a
+Throughput is measured on the command with all its workers, from the first shard on disk to the last. Stages are
+measured in this process, on one core. With `--blenderproc` (a source checkout of BlenderProc and a
 Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh at the same side, distances and
 samples per pixel in turn with ours: one scene and one hypothesis image a pair, depth and segmentation with both, with
 its default denoiser and with none, on all cores. It renders no occluders, background, contours or distance transforms
@@ -64,7 +64,7 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     limit_threads(1)
     scenes = max(scenes, scenes_per_shard(config))  # encoding is timed on whole shards
     maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
-    card = data_card.make_card(config, config.shard_size, {1: mesh}, Assets())
+    card = data_card.rendered_card(config, config.shard_size, {1: mesh}, Assets())
     for scene in range(3):  # loads, compiles
         maker.samples(10_000_000 + scene)
     watch = Stopwatch()
@@ -85,13 +85,13 @@ def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
     )
     encode = (time.perf_counter() - began) / (len(whole) * config.shard_size)
     maker.close()
-    found = {name: 1e3 * seconds / pairs for name, seconds in watch.seconds.items()}
-    found["background, sensor"] = found.pop("render, background, sensor") - found["render"]
-    found["other"] = 1e3 * total / pairs - sum(found.values())
-    found["encode"] = 1e3 * encode
+    stage_ms = {name: 1e3 * seconds / pairs for name, seconds in watch.seconds.items()}
+    stage_ms["background, sensor"] = stage_ms.pop("render, background, sensor") - stage_ms["render"]
+    stage_ms["other"] = 1e3 * total / pairs - sum(stage_ms.values())
+    stage_ms["encode"] = 1e3 * encode
     return {
-        "ms_per_pair": {name: round(value, 3) for name, value in found.items()},
-        "ms_per_pair_in_all": round(sum(found.values()), 3),
+        "ms_per_pair": {name: round(value, 3) for name, value in stage_ms.items()},
+        "ms_per_pair_in_all": round(sum(stage_ms.values()), 3),
         "bytes_per_pair": size // (len(whole) * config.shard_size),
     }
 
@@ -102,7 +102,7 @@ def scenes_per_shard(config: SynthConfig) -> int:
 
 
 def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
-    """Pairs a second of the command, from its first shard to its last."""
+    """Pairs per second of the command, from its first shard to its last."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "shards"
         process = subprocess.Popen(
@@ -110,26 +110,26 @@ def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
             stderr=subprocess.PIPE,
             text=True,
         )
-        seen: list[tuple[float, int]] = []
+        commits: list[tuple[float, int]] = []
         manifest = out / "manifest.jsonl"
         while process.poll() is None:
             count = 0
             if manifest.is_file():
                 count = sum(json.loads(line)["n"] for line in manifest.read_text().splitlines())
-            if count and (not seen or count > seen[-1][1]):
-                seen.append((time.perf_counter(), count))
+            if count and (not commits or count > commits[-1][1]):
+                commits.append((time.perf_counter(), count))
             time.sleep(0.02)
         if process.returncode:
             assert process.stderr is not None
             sys.exit(process.stderr.read())
-    # the first shards of all workers come together: the clock starts when the last of them is there
-    first = seen[min(arguments.workers, len(seen) - 1) - 1]
-    rate: float = (seen[-1][1] - first[1]) / (seen[-1][0] - first[0])
+    # the first shards of all workers come together: the clock starts at the last one
+    first = commits[min(arguments.workers, len(commits) - 1) - 1]
+    rate: float = (commits[-1][1] - first[1]) / (commits[-1][0] - first[0])
     return rate
 
 
 def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
-    """Time a scene and memory of one process at the beginning and at the end of many scenes."""
+    """Time per scene and memory of a process at the beginning and at the end of many scenes."""
     limit_threads(1)
     maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
     process, h = psutil.Process(), config.hypotheses_per_scene
@@ -138,7 +138,7 @@ def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
         began, cpu_began = time.perf_counter(), time.process_time()
         maker.samples(scene)
         seconds.append(time.perf_counter() - began)
-        cpu_s.append(time.process_time() - cpu_began)  # what other work on the machine changes little
+        cpu_s.append(time.process_time() - cpu_began)  # hardly affected by other work on the machine
         rss.append(process.memory_info().rss)
     maker.close()
     start, span = -(-100 // h), max(1, scenes // 10)
@@ -158,7 +158,7 @@ def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
 
 
 def peer(arguments: argparse.Namespace, config: SynthConfig, mesh: Mesh, denoiser: str) -> float:
-    """Seconds a pair of BlenderProc."""
+    """Seconds per pair of BlenderProc."""
     camera: Camera = config.camera.camera()
     side_px = make_target(1, mesh, config).window_side_px
     near_m, far_m = config.distance.range_m(mesh.diameter_m)
@@ -208,7 +208,7 @@ def main() -> None:
             for denoiser, seconds in peers.items():
                 seconds.append(peer(arguments, config, mesh, denoiser))
                 print(f"BlenderProc, denoiser {denoiser}: {seconds[-1]:.3f} s a pair", flush=True)
-    found: Fields = {
+    result: Fields = {
         "engine": config.engine,
         "patch_px": config.patch_px,
         "samples": config.samples,
@@ -219,15 +219,15 @@ def main() -> None:
     }
     if arguments.blenderproc is not None:
         for denoiser, seconds in peers.items():
-            found[f"blenderproc_{denoiser}_s_per_pair"] = round(statistics.median(seconds), 4)
+            result[f"blenderproc_{denoiser}_s_per_pair"] = round(statistics.median(seconds), 4)
             ratios = np.multiply(seconds, rates)
-            found[f"times_blenderproc_{denoiser}"] = round(float(np.median(ratios)), 1)
-    found |= stages(config, mesh, arguments.stage_scenes)
-    for name, value in found["ms_per_pair"].items():
+            result[f"times_blenderproc_{denoiser}"] = round(float(np.median(ratios)), 1)
+    result |= stages(config, mesh, arguments.stage_scenes)
+    for name, value in result["ms_per_pair"].items():
         print(f"{name:24s} {value:8.3f} ms a pair")
     if arguments.flat_scenes:
-        found["flat"] = flatness(config, mesh, arguments.flat_scenes)
-    print(json.dumps(found))
+        result["flat"] = flatness(config, mesh, arguments.flat_scenes)
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def render(
     per_scene = config.hypotheses_per_scene
     scenes = concatenate(maker.samples(i, per_scene) for i in range(-(-n // per_scene)))
     maker.close()
-    card = data_card.make_card(config, n, meshes, assets)
+    card = data_card.rendered_card(config, n, meshes, assets)
     return {name: values[:n] for name, values in scenes.items()}, json.loads(json.dumps(card))
 
 

@@ -1,13 +1,13 @@
-"""Faults on purpose, and whether a dataset survives them byte for byte.
+"""Fault injection: a dataset must survive every fault byte for byte.
 
     python benchmarks/soak.py --out /tmp/soak --kills 20 --minutes 10
     python benchmarks/soak.py --out /tmp/soak --engine cycles --n 96 --kills 6
 
-One dataset is rendered in peace. Then others of the same settings are rendered while workers and the command itself are
-killed with `kill -9` at random, the disk is full, the folder turns read-only, files of the dataset are lost or cut off,
-a second command writes into the same folder, and a folder of objects holds one that cannot be loaded. Each must end
-with the files of the first, by SHA-256. Disk full and read-only need a tmpfs, so root; otherwise they are left out,
-which is said. The last line is JSON; the exit code is 0 when nothing was lost.
+A first dataset is rendered without faults. Then others of the same settings are rendered while workers and the command
+itself are killed with `kill -9` at random, the disk is full, the folder turns read-only, files of the dataset are lost
+or truncated, a second command writes into the same folder, and a folder of objects holds one that cannot be loaded.
+Each must end with the files of the first, by SHA-256. Disk full and read-only need a tmpfs, so root; otherwise they are
+skipped and reported. The last line is JSON; the exit code is 0 when nothing was lost.
 """
 
 import argparse
@@ -62,34 +62,35 @@ class Soak:
         ]
 
     def start(self, folder: Path) -> subprocess.Popen[str]:
-        """Start the command in a session of its own, so that what outlives it can be seen."""
+        """Start the command in a session of its own, so that processes that outlive it can be detected."""
         return subprocess.Popen(self.command(folder), stderr=subprocess.PIPE, text=True, start_new_session=True)
 
-    def finish(self, command: list[str], expected: int = 0, says: str = "") -> str:
+    def finish(self, command: list[str], expected: int = 0, message: str = "") -> str:
         """Run a command to its end; its standard error.
 
         Raises:
-            Fault: Another exit code, a traceback, or without the words.
+            Fault: Another exit code, a traceback, or no such message.
         """
         done = subprocess.run(command, capture_output=True, text=True, check=False)
-        self.judge(done.returncode, done.stderr, expected, says)
+        self.check_exit(done.returncode, done.stderr, expected, message)
         return done.stderr
 
-    def judge(self, code: int, said: str, expected: int, says: str) -> None:
-        """Raise a Fault unless a command ended as it should."""
-        last = said.strip().splitlines()[-1] if said.strip() else "nothing"
-        if code != expected or "Traceback" in said or says not in said:
-            (self.out / "said.txt").write_text(said)
-            raise Fault(f"exit code {code}, expected {expected} with {says!r} and no traceback; it said: {last}")
+    def check_exit(self, code: int, stderr: str, expected: int, message: str) -> None:
+        """Raise a Fault unless a command ended with this exit code and message."""
+        last = stderr.strip().splitlines()[-1] if stderr.strip() else "nothing"
+        if code != expected or "Traceback" in stderr or message not in stderr:
+            (self.out / "stderr.txt").write_text(stderr)
+            raise Fault(f"exit code {code}, expected {expected} with {message!r} and no traceback; last line: {last}")
 
     def compare(self, folder: Path, name: str) -> None:
         """Raise a Fault unless a folder holds the files of the undisturbed dataset and no others."""
-        found, wanted = hashes(folder), hashes(self.out / "undisturbed")
-        for key in sorted({*found, *wanted}):
-            if found.get(key) != wanted.get(key):
-                what = "differs" if key in found and key in wanted else "is missing" if key in wanted else "is too much"
-                raise Fault(f"{name}: {key} {what}")
-        say(f"{name}: {len(found)} files, identical")
+        actual, expected = hashes(folder), hashes(self.out / "undisturbed")
+        for key in sorted({*actual, *expected}):
+            if actual.get(key) != expected.get(key):
+                both = key in actual and key in expected
+                defect = "differs" if both else "is missing" if key in expected else "is unexpected"
+                raise Fault(f"{name}: {key} {defect}")
+        show(f"{name}: {len(actual)} files, identical")
         shutil.rmtree(folder)
 
     def undisturbed(self) -> None:
@@ -100,14 +101,14 @@ class Soak:
         while not (folder / "manifest.jsonl").exists() and process.poll() is None:
             time.sleep(0.01)
         self.start_s = time.monotonic() - began
-        self.judge(process.wait(), process.communicate()[1], 0, "complete")
+        self.check_exit(process.wait(), process.communicate()[1], 0, "complete")
         size = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-        say(f"undisturbed: {len(hashes(folder))} files, {size / 1e6:.1f} MB, {time.monotonic() - began:.0f} s")
+        show(f"undisturbed: {len(hashes(folder))} files, {size / 1e6:.1f} MB, {time.monotonic() - began:.0f} s")
 
     def kills(self) -> None:
-        """`kill -9` of workers and of the command, as the dice fall, until there were enough or the time is up.
+        """`kill -9` of random workers and of the command, until there are enough or the time is up.
 
-        A kill waits for up to twice the time that the command takes to its first shard: half of them hit the start.
+        A kill waits for up to twice the time of the command's first shard, so that half of the kills hit the start.
         """
         folder, process, done = self.out / "killed", None, 0
         ends_s = time.monotonic() + 60 * self.arguments.minutes
@@ -116,13 +117,13 @@ class Soak:
             time.sleep(self.rng.uniform(0.0, 2 * self.start_s))
             workers = self.workers_of(process)
             if process.poll() is not None:
-                self.judge(process.returncode, process.communicate()[1], 0, "complete")
+                self.check_exit(process.returncode, process.communicate()[1], 0, "complete")
                 self.compare(folder, f"after {done} kills")
                 self.counts["rounds"] += 1
                 process = None
                 continue
-            if self.rng.random() < self.arguments.driver_share:
-                say(f"kill -9 of the command, pid {process.pid}")
+            if self.rng.random() < self.arguments.driver_fraction:
+                show(f"kill -9 of the command, pid {process.pid}")
                 process.kill()
                 process.communicate()
                 self.counts["driver_kills"] += 1
@@ -130,17 +131,17 @@ class Soak:
                 process = None
             elif workers:
                 victim = workers[int(self.rng.integers(len(workers)))]
-                say(f"kill -9 of a worker, pid {victim.pid}")
+                show(f"kill -9 of a worker, pid {victim.pid}")
                 victim.kill()
                 self.counts["worker_kills"] += 1
             done = self.counts["driver_kills"] + self.counts["worker_kills"]
         if done < self.arguments.kills:
             self.skipped.append(f"{self.arguments.kills - done} kills: --minutes was over")
         if process is not None:
-            _, said = process.communicate()
-            self.judge(process.returncode, said, 0, "complete")
+            _, stderr = process.communicate()
+            self.check_exit(process.returncode, stderr, 0, "complete")
         elif folder.exists():
-            self.finish(self.command(folder), says="complete")
+            self.finish(self.command(folder), message="complete")
         else:  # the last round ended by itself and was compared
             return
         self.compare(folder, f"after {done} kills")
@@ -153,9 +154,9 @@ class Soak:
                 return []
             try:
                 children = psutil.Process(process.pid).children()
-                if found := [p for p in children if "spawn_main" in " ".join(p.cmdline())]:
-                    return found
-            except psutil.Error:  # it ended between two looks
+                if workers := [p for p in children if "spawn_main" in " ".join(p.cmdline())]:
+                    return workers
+            except psutil.Error:  # it ended meanwhile
                 pass
             time.sleep(0.05)
         raise Fault(f"no worker started in {START_S:.0f} s")
@@ -174,10 +175,10 @@ class Soak:
                 time.sleep(0.01)
             used = shutil.disk_usage(small).used
             self.mount("remount", f"size={used + (64 << 10)}", small)
-            _, said = process.communicate()
-            self.judge(process.returncode, said, 1, "the disk is full")
+            _, stderr = process.communicate()
+            self.check_exit(process.returncode, stderr, 1, "the disk is full")
             self.mount("remount", "size=2g", small)
-            self.finish(self.command(folder), says="complete")
+            self.finish(self.command(folder), message="complete")
             self.compare(folder, "after a full disk")
 
     def read_only(self) -> None:
@@ -192,17 +193,17 @@ class Soak:
                 time.sleep(0.01)
             while process.poll() is None and not self.mount("remount", "ro", locked):
                 time.sleep(0.005)  # busy while a file is open for writing
-            _, said = process.communicate()
-            self.judge(process.returncode, said, 1, "no permission to write here")
+            _, stderr = process.communicate()
+            self.check_exit(process.returncode, stderr, 1, "no permission to write here")
             self.finish(self.command(folder), 1, "no permission to write here")
             self.mount("remount", "rw", locked)
-            self.finish(self.command(folder), says="complete")
+            self.finish(self.command(folder), message="complete")
             self.compare(folder, "after a read-only folder")
 
     def mount(self, *words: str | Path) -> bool:
         """Change a mount; whether that worked."""
-        options, place = ",".join(str(w) for w in words[:-1]), str(words[-1])
-        return subprocess.run(["mount", "-o", options, place], capture_output=True, check=False).returncode == 0
+        options, folder = ",".join(str(w) for w in words[:-1]), str(words[-1])
+        return subprocess.run(["mount", "-o", options, folder], capture_output=True, check=False).returncode == 0
 
     def damage(self) -> None:
         """A file of the dataset is lost and another cut off."""
@@ -212,41 +213,41 @@ class Soak:
         lost, cut = (files[i] for i in self.rng.choice(len(files), 2, replace=False))
         lost.unlink()
         os.truncate(cut, cut.stat().st_size // 2)
-        self.finish(self.command(folder), says="is damaged")
+        self.finish(self.command(folder), message="is damaged")
         self.compare(folder, "after damage")
 
     def two_at_once(self) -> None:
-        """A second command in the same folder is refused, and the first one does not notice."""
+        """A second command in the same folder is refused, and the first one is not affected."""
         folder = self.out / "twice"
         first = self.start(folder)
         self.workers_of(first)
         second = subprocess.run(self.command(folder), capture_output=True, text=True, check=False)
         if first.poll() is None:
-            self.judge(second.returncode, second.stderr, 1, "another synthgen is rendering into this folder")
-        _, said = first.communicate()
-        self.judge(first.returncode, said, 0, "complete")
+            self.check_exit(second.returncode, second.stderr, 1, "another synthgen is rendering into this folder")
+        _, stderr = first.communicate()
+        self.check_exit(first.returncode, stderr, 0, "complete")
         self.compare(folder, "after two commands at once")
 
     def bad_mesh(self) -> None:
-        """A mesh that cannot be loaded among good ones stops the command before it starts, or is left out if wished."""
+        """A mesh that cannot be loaded among good ones stops the command before it starts, or is skipped on request."""
         models = self.out / "models"
         models.mkdir()
         for number, mesh in enumerate(self.arguments.object, start=1):
             shutil.copy(mesh, models / f"obj_{number:06d}{mesh.suffix}")
         bad = models / f"obj_{len(self.arguments.object) + 1:06d}.ply"
-        bad.write_bytes(self.arguments.object[0].read_bytes()[:2000])  # cut off: more promised than there is
+        bad.write_bytes(self.arguments.object[0].read_bytes()[:2000])  # truncated
         folder = self.out / "with_bad_mesh"
         self.finish(self.command(folder, [models]), 1, bad.name)
         if folder.exists():
             raise Fault("a mesh that cannot be loaded leaves a folder behind")
-        said = self.finish(self.command(folder, [models], "--skip-bad-objects"), says="complete")
-        if bad.name not in said:
-            raise Fault("--skip-bad-objects does not name what it leaves out")
+        stderr = self.finish(self.command(folder, [models], "--skip-bad-objects"), message="complete")
+        if bad.name not in stderr:
+            raise Fault("--skip-bad-objects does not name the skipped mesh")
         shutil.rmtree(folder)
-        say("a mesh that cannot be loaded: named, left out with --skip-bad-objects")
+        show("a mesh that cannot be loaded: named, left out with --skip-bad-objects")
 
     def run(self) -> dict[str, object]:
-        """Everything; the facts for the last line."""
+        """Run all faults; the facts for the last line."""
         began = time.monotonic()
         self.undisturbed()
         for fault in self.arguments.faults:
@@ -271,7 +272,7 @@ def hashes(folder: Path) -> dict[str, str]:
 
 
 def wait_for_the_end_of(session: int) -> None:
-    """Wait until no process of a session is left: what a killed command started must not outlive it."""
+    """Wait until no process of a session is left: children of a killed command must not outlive it."""
     for _ in range(int(START_S / 0.1)):
         try:
             os.killpg(session, 0)
@@ -283,21 +284,21 @@ def wait_for_the_end_of(session: int) -> None:
 
 
 @contextmanager
-def tmpfs(place: Path, size_bytes: int) -> Iterator[Path | None]:
+def tmpfs(folder: Path, size_bytes: int) -> Iterator[Path | None]:
     """A small file system in memory, None where it cannot be mounted."""
-    place.mkdir()
-    mounted = ["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", str(place)]
+    folder.mkdir()
+    mounted = ["mount", "-t", "tmpfs", "-o", f"size={size_bytes}", "tmpfs", str(folder)]
     if os.geteuid() != 0 or subprocess.run(mounted, capture_output=True, check=False).returncode != 0:
         yield None
         return
     try:
-        yield place
+        yield folder
     finally:
-        subprocess.run(["umount", "-l", str(place)], capture_output=True, check=False)
+        subprocess.run(["umount", "-l", str(folder)], capture_output=True, check=False)
 
 
-def say(text: str) -> None:
-    """One line of what is done."""
+def show(text: str) -> None:
+    """Print a line."""
     print(text, flush=True)
 
 
@@ -310,9 +311,11 @@ def main() -> int:
     parser.add_argument("--n", type=int, default=2000, help="pairs of a dataset")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--kills", type=int, default=20)
-    parser.add_argument("--driver-share", type=float, default=0.3, help="of the kills that hit the command itself")
+    parser.add_argument(
+        "--driver-fraction", type=float, default=0.3, help="fraction of the kills that hit the command itself"
+    )
     parser.add_argument("--minutes", type=float, default=10.0, help="time for the kills")
-    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, help="which of them")
+    parser.add_argument("--faults", nargs="+", choices=FAULTS, default=FAULTS, help="faults to inject")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="as of `synthgen render`")
     arguments = parser.parse_args()
@@ -322,11 +325,11 @@ def main() -> int:
     try:
         facts = Soak(arguments).run()
     except Fault as fault:
-        say(f"FAULT: {fault}; the folders stay in {arguments.out}")
-        say(json.dumps({"identical": False, "fault": str(fault)}))
+        show(f"FAULT: {fault}; the folders stay in {arguments.out}")
+        show(json.dumps({"identical": False, "fault": str(fault)}))
         return 1
     shutil.rmtree(arguments.out)
-    say(json.dumps(facts))
+    show(json.dumps(facts))
     return 0
 
 

@@ -41,7 +41,7 @@ def checks_table() -> str:
     findings = importlib.import_module("synthgen.verify.findings")
     rows = [(name, _cell(what), tolerance) for name, (what, tolerance) in findings.DATASET_CHECKS.items()]
     for check in importlib.import_module("synthgen.verify.checks").CHECKS:
-        what = f"{check.what} On the samples drawn again." if check.drawn else check.what
+        what = f"{check.what} On the re-rendered samples." if check.rerendered else check.what
         text = f"{_cell(what)}<br><small>Tolerance: {_cell(check.why)}.</small>"
         rows.append((check.name, text, findings.tolerance_text(check.tolerance, check.unit)))
     lines = ["| check | what holds | tolerance |", "|---|---|---|"]

@@ -22,7 +22,7 @@ def write_dataset(
     quarantined: Collection[int] = (),
 ) -> ShardJob:
     """Render a dataset as `synthgen render` does, all of it or its first shards."""
-    card = data_card.make_card(config, n, meshes, Assets())
+    card = data_card.rendered_card(config, n, meshes, Assets())
     writer = ShardWriter.create(str(url), card)
     for key, data in data_card.model_files(meshes, {}).items():
         writer.add_file(key, data)

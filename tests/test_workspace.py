@@ -41,7 +41,7 @@ ORDER = {  # folders and top-level modules of a package in the order of its work
         "errors se3 files config renamed processes numba_jit ply symmetry mesh simplify window camera contour raster "
         "store shard bop html command_line"
     ),
-    "synthgen": "scene engine machine config image inputs engines draw pairs bop run inspect verify cli",
+    "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (
         "errors device batch refiner config geometry image models data training baselines refine tracking cli __main__"
     ),

@@ -15,12 +15,12 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from synthgen import lock
 from synthgen.bop import dataset_writer
 from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import load_config
 from synthgen.inputs.assets import Assets
-from synthgen.run import lock
 
 SMALL_CAMERA = tuple(
     f"camera.{key}={value}"

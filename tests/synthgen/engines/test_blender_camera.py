@@ -5,7 +5,7 @@ import pytest
 from blender_scenes import SKEWED, at, box
 from posecore import se3
 from posecore.camera import project
-from synthgen.engines.blender.camera import blender_from_opencv, lens_of, occupied_region
+from synthgen.engines.blender.camera import blender_from_opencv, lens_for, occupied_region
 
 REGION = (-20, -60, 160, 220)
 
@@ -22,7 +22,7 @@ def test_axes_turn_about_x_by_half_a_turn():
 
 
 def test_lens_keeps_the_ratio_of_the_focal_lengths():
-    lens = lens_of(SKEWED, REGION)
+    lens = lens_for(SKEWED, REGION)
     assert lens.pixel_aspect_y / lens.pixel_aspect_x == pytest.approx(SKEWED.K[0, 0] / SKEWED.K[1, 1])
     assert min(lens.pixel_aspect_x, lens.pixel_aspect_y) == 1.0
 

@@ -10,7 +10,8 @@ from posecore.errors import RenderError
 from synthgen.cli import main
 from synthgen.config import load_config
 from synthgen.engines import devices
-from synthgen.run import cluster
+from synthgen.inputs.sources import Sources
+from synthgen.run import cluster, render
 from synthgen.run.shard_job import ShardJob
 from synthgen.run.worker import RendererPlugin
 
@@ -35,9 +36,8 @@ def test_gpus_keep_the_names_that_the_environment_gives(monkeypatch):
     assert devices.visible_gpus(2) == ("2", "5")
 
 
-def test_the_card_names_a_device_and_never_auto(monkeypatch):
-    module = sys.modules["synthgen.cli.render"]
-    monkeypatch.setattr(devices, "list_gpus", lambda: {"optix": 2, "cuda": 2})
+def test_the_card_names_a_device_and_never_auto(monkeypatch, tug_ply):
+    monkeypatch.setattr(render, "list_gpus", lambda: {"optix": 2, "cuda": 2})
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     for wish, engine, chosen, gpus in (
         ("auto", "cycles", "optix", ("0", "1")),
@@ -46,8 +46,9 @@ def test_the_card_names_a_device_and_never_auto(monkeypatch):
         ("auto", "raster", "cpu", ()),
     ):
         config = load_config("default", [f"device={wish}", f"engine={engine}"])
-        found, names = module._with_device(config, None)
-        assert (found.device, names) == (chosen, gpus)
+        job = render.RenderJob(out="out", n=4, config=config, sources=Sources(objects=(tug_ply,)))
+        shards, names = render._loaded(job)
+        assert (shards.config.device, shards.card["config"]["device"], names) == (chosen, chosen, gpus)
 
 
 def test_auto_needs_this_machine(tug_ply, tmp_path):
@@ -77,10 +78,10 @@ def test_a_blender_that_does_not_start_is_one_line(monkeypatch):
 
 @pytest.mark.blender
 def test_this_machine_without_gpu_says_so(tug_ply, tmp_path, monkeypatch):
-    found = devices.list_gpus()
-    if found:
+    gpus = devices.list_gpus()
+    if gpus:
         pytest.skip("this machine has a GPU")
-    monkeypatch.setattr(devices, "list_gpus", lambda: found)
+    monkeypatch.setattr(render, "list_gpus", lambda: gpus)
     arguments = ["--object", str(tug_ply), "--n", "4", "--out", str(tmp_path / "out"), "--device", "optix"]
     result = CliRunner().invoke(main, ["render", *arguments])
     assert result.exit_code == 1

@@ -1,13 +1,15 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from posecore.errors import ConfigError, MeshError
+from posecore.errors import ConfigError, DatasetError, MeshError
 from synthgen.cli import main
-from synthgen.inputs.sources import Sources, find_meshes
+from synthgen.inputs.sources import Sources, find_meshes, load_symmetries, object_ids
+from synthgen.pairs.data_card import model_files
 
 
 def folder_of(root, tug_ply, names):
@@ -129,3 +131,31 @@ def test_a_mesh_alone_has_the_symmetries_that_are_listed_beside_it(tug_ply, bobb
         shutil.copy(bobbin_ply, tmp_path / name)
         alone = Sources(objects=(tmp_path / name,))
         assert bool(alone.infos(alone.meshes())) is known
+
+
+def test_symmetries_are_found_by_name_or_id(tug, tmp_path):
+    entry = {"diameter": 118.9, "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
+    for key in ("tug", "1"):
+        file = tmp_path / "models_info.json"
+        file.write_text(json.dumps({key: entry}))
+        infos = load_symmetries(file, {1: tug})
+        assert len(infos[1].symmetries_discrete) == 1
+        files = model_files({1: tug}, infos)
+        assert sorted(files) == ["models/models_info.json", "models/obj_000001.ply"]
+        assert "symmetries_discrete" in json.loads(files["models/models_info.json"])["1"]
+    file.write_text(json.dumps({"cup": entry}))
+    with pytest.raises(DatasetError, match="cup"):
+        load_symmetries(file, {1: replace(tug, path="tug.ply")})
+    file.write_text(json.dumps({"5": entry}))  # another dataset's numbers: no symmetry may get lost in silence
+    with pytest.raises(DatasetError, match="no entry for 1, tug; its keys are 5"):
+        load_symmetries(file, {1: tug})
+    with pytest.raises(DatasetError, match="cannot be read"):
+        load_symmetries(tmp_path / "none.json", {1: tug})
+
+
+def test_object_ids_follow_bop_names_or_the_order():
+    assert object_ids(["a.ply", "b.ply"]) == [1, 2]
+    assert object_ids(["x/obj_000009.ply", "obj_000002.ply"]) == [9, 2]
+    assert object_ids(["obj_000009.ply", "b.ply"]) == [1, 2]
+    with pytest.raises(ConfigError, match="object id 3"):
+        object_ids(["a/obj_000003.ply", "b/obj_000003.ply"])

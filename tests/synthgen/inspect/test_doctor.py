@@ -5,16 +5,16 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from synthgen import machine
 from synthgen.cli import main
 from synthgen.inspect import doctor
-from synthgen.inspect.speed import Speed
+from synthgen.inspect.speed import EngineSpeed
+from synthgen.run.estimate import RunEstimate
 
 MISSING_LIBRARY = "raise ImportError('libXi.so.6: cannot open shared object file: No such file or directory')"
 
 
-def by_name(found):
-    return {item.name: item for item in found}
+def by_name(checks):
+    return {check.name: check for check in checks}
 
 
 @pytest.fixture
@@ -23,27 +23,27 @@ def no_blender(monkeypatch):
 
 
 def test_a_missing_library_is_named_with_its_package(no_blender, tmp_path):
-    found, engines = doctor.look(tmp_path, [])
-    bpy = by_name(found)["bpy"]
+    checks, engines = doctor.check_machine(tmp_path, [])
+    bpy = by_name(checks)["bpy"]
     assert (bpy.state, bpy.remedy) == ("warning", "apt-get install libxi6")
     assert "libXi.so.6" in bpy.text
     assert engines.names == ("raster",)
-    assert by_name(doctor.look(tmp_path, ["cycles"])[0])["bpy"].state == "missing"
+    assert by_name(doctor.check_machine(tmp_path, ["cycles"])[0])["bpy"].state == "missing"
 
 
 def test_a_module_that_crashes_or_is_absent_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "_BPY", "import os; os.abort()")
-    assert by_name(doctor.look(tmp_path, [])[0])["bpy"].text == "crashes (SIGABRT)"
+    assert by_name(doctor.check_machine(tmp_path, [])[0])["bpy"].text == "crashes (SIGABRT)"
     monkeypatch.setattr(doctor, "_BPY", "import a_module_that_is_not_there")
-    bpy = by_name(doctor.look(tmp_path, [])[0])["bpy"]
+    bpy = by_name(doctor.check_machine(tmp_path, [])[0])["bpy"]
     assert "a_module_that_is_not_there" in bpy.text
     assert "pip install" in bpy.remedy
 
 
 def test_without_gl_nothing_can_run_and_the_command_fails(no_blender, monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "_GL", "raise RuntimeError('no EGL device')")
-    found, engines = doctor.look(tmp_path, [])
-    assert by_name(found)["GL"].state == "missing"
+    checks, engines = doctor.check_machine(tmp_path, [])
+    assert by_name(checks)["GL"].state == "missing"
     assert engines.names == ()
     result = CliRunner().invoke(main, ["doctor", "--out", str(tmp_path), "--seconds", "5"])
     assert result.exit_code == 1
@@ -53,47 +53,38 @@ def test_without_gl_nothing_can_run_and_the_command_fails(no_blender, monkeypatc
 @pytest.mark.parametrize(("device", "software"), [("llvmpipe (LLVM 15)", True), ("NVIDIA H200/PCIe/SSE2", False)])
 def test_software_gl_is_warned_about(no_blender, monkeypatch, tmp_path, device, software):
     monkeypatch.setattr(doctor, "_GL", f"import json; print(json.dumps([{device!r}, {software}]))")
-    gl = by_name(doctor.look(tmp_path, [])[0])["GL"]
+    gl = by_name(doctor.check_machine(tmp_path, [])[0])["GL"]
     assert device in gl.text
     assert gl.state == ("warning" if software else "ok")
-    assert doctor.Engines(names=("cycles", "eevee", "raster"), software_gl=software).worth_measuring() == (
+    assert doctor.UsableEngines(names=("cycles", "eevee", "raster"), software_gl=software).worth_measuring() == (
         ("cycles", "raster") if software else ("cycles", "eevee", "raster")
     )
 
 
-def test_resources_respect_the_control_group(monkeypatch, tmp_path):
-    monkeypatch.setattr(machine, "_CGROUP", tmp_path)
-    (tmp_path / "cpu.max").write_text("50000 100000\n")
-    (tmp_path / "memory.max").write_text(f"{256 * 2**20}\n")
-    here = machine.machine()
-    assert here.cores == 0.5
-    assert here.memory_bytes == 256 * 2**20
-    (tmp_path / "cpu.max").write_text("max 100000\n")
-    (tmp_path / "memory.max").write_text("max\n")
-    here = machine.machine()
-    assert here.cores == machine.cores()
-    assert here.memory_bytes > 256 * 2**20
-    assert machine.free_bytes(tmp_path / "not" / "there") == machine.free_bytes(tmp_path)
-
-
 def test_time_and_space_are_extrapolated():
-    speed = Speed(engine="cycles", pairs=400, seconds=20.0, bytes_per_pair=1e5, memory_bytes=10**9)
-    assert speed.hours(72_000) == pytest.approx(1.0)
+    measured = RunEstimate(pairs=400, seconds=20.0, bytes_per_pair=1e5, memory_bytes=10**9)
+    speed = EngineSpeed(engine="cycles", measured=measured)
+    assert speed.as_dict(72_000)["hours"] == pytest.approx(1.0)
     assert "72000 pairs in about 1.0 hours and 7.2 GB (20 pairs/s" in speed.text(72_000)
     assert "about 10 minutes" in speed.text(12_000)
-    assert Speed(engine="cycles", problem="why").text(5) == "why"
-    full = doctor.disk_found([speed], 10**12, Path())
+    failed = EngineSpeed(engine="cycles", problem="why")
+    assert failed.text(5) == "why"
+    assert (failed.as_dict(5)["hours"], failed.as_dict(5)["pairs_per_s"]) == (None, 0.0)
+    full = doctor.check_space([speed, failed], 10**12, Path())
     assert [item.state for item in full] == ["missing"]
     assert "100000000 GB" in full[0].text.replace("1e+08", "100000000")
-    assert doctor.disk_found([speed], 10, Path()) == []
+    assert doctor.check_space([speed, failed], 10, Path()) == []
+    report = doctor.DoctorReport(checks=tuple(full), speeds=(speed, failed), n=5)
+    assert report.missing == ["disk space", "cycles"]
 
 
-def test_a_look_without_measuring_is_json_on_demand(no_blender, tmp_path):
+def test_checks_without_measuring_are_json_on_demand(no_blender, tmp_path):
     result = CliRunner().invoke(main, ["doctor", "--seconds", "0", "--json", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
-    found = json.loads(result.stdout)
-    assert {"python", "bpy", "GL", "cores", "memory", "disk", "/dev/shm"} <= {item["name"] for item in found["found"]}
-    assert found["speed"] == []
+    report = json.loads(result.stdout)
+    names = {check["name"] for check in report["checks"]}
+    assert {"python", "bpy", "GL", "cores", "memory", "disk", "/dev/shm"} <= names
+    assert report["speed"] == []
 
 
 def test_wrong_input_is_refused_before_anything_is_measured(tmp_path):

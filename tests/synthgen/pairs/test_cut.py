@@ -20,7 +20,7 @@ from synthgen.config import CutConfig, PerturbationConfig
 from synthgen.inspect.info import dataset_info, info_text
 from synthgen.pairs import cut, cut_plan
 from synthgen.pairs.cut import cut_pairs
-from synthgen.pairs.data_card import model_files
+from synthgen.pairs.data_card import cut_card, model_files
 from synthgen.pairs.merge import merged_card, open_parts, write_merged
 from synthgen.verify.page import report_page
 from synthgen.verify.verify import verify
@@ -51,7 +51,7 @@ def own(images, tmp_path):
 
 def cut_to(url, dataset, config, hypotheses=None, on_shard=lambda n: None):
     planned = cut_plan.plan(dataset, config, hypotheses)
-    writer = ShardWriter.create(str(url), cut_plan.make_card(dataset, planned, config, drawn=hypotheses is None))
+    writer = ShardWriter.create(str(url), cut_card(dataset, planned, config, drawn=hypotheses is None))
     for key, data in model_files(planned.meshes, {}).items():
         writer.add_file(key, data)
     cut_pairs(dataset, planned, config, writer, on_shard)
@@ -84,7 +84,7 @@ def test_every_check_of_a_dataset_passes(images, window, tmp_path):
     report = verify(str(tmp_path / "shards"))
     assert [f.name for f in report.findings if not f.ok] == []
     checked = {f.name: f.covered for f in report.findings}
-    assert checked["truth drawn again"] == report.committed >= 12
+    assert checked["ground truth re-rendered"] == report.committed >= 12
     assert "angle" not in checked
     page = report_page(report)
     assert f"3 of {images.name}, split test" in page
@@ -313,7 +313,7 @@ def test_fixed_windows_need_one_focal_length(own):
     with pytest.raises(DatasetError, match=r"image 0 of scene 1 has fx 286 and image 1 of scene 1 429, expected one"):
         cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL, window="fixed"))
     planned = cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL))
-    assert cut_plan.make_card(own, planned, CutConfig(**SMALL))["camera"]["shared"] is False
+    assert cut_card(own, planned, CutConfig(**SMALL))["camera"]["shared"] is False
 
 
 def test_pairs_of_one_image_are_one_scene(images, tmp_path):
@@ -434,7 +434,7 @@ def test_from_the_command_line(images, tmp_path):
     shutil.copytree(images.split_path, tmp_path / "two" / "train")
     unsure = CliRunner().invoke(main, ["cut", str(tmp_path / "two"), "--out", str(tmp_path / "x")])
     assert unsure.exit_code == 2
-    assert "has the splits test, train: name one with --split" in unsure.output
+    assert "has the splits test, train: choose with --split" in unsure.output
     failed = CliRunner().invoke(main, ["cut", str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")])
     assert failed.exit_code == 1
     assert "no such folder" in failed.output

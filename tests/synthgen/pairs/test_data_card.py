@@ -1,19 +1,16 @@
 import json
 import platform
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import Mesh
 from synthgen.config import load_config
-from synthgen.draw.target import object_ids
 from synthgen.inputs.assets import Assets
 from synthgen.pairs import data_card
 
 
 def test_the_card_tells_everything_but_time_and_place(config_of, tug):
-    card = data_card.make_card(config_of(), 10, {1: tug}, Assets())
+    card = data_card.rendered_card(config_of(), 10, {1: tug}, Assets())
     text = json.dumps(card)
     assert platform.node() not in text
     assert str(tug.path) not in text
@@ -21,14 +18,14 @@ def test_the_card_tells_everything_but_time_and_place(config_of, tug):
     assert card["config"]["occluders"]["library"] == 8
     assert card["versions"]["posecore"]
     assert "bpy" not in card["versions"]
-    assert "bpy" in data_card.make_card(config_of("engine=cycles"), 10, {1: tug}, Assets())["versions"]
+    assert "bpy" in data_card.rendered_card(config_of("engine=cycles"), 10, {1: tug}, Assets())["versions"]
 
 
 def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"1")
-    one = data_card.make_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
+    one = data_card.rendered_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
     (tmp_path / "a.jpg").write_bytes(b"2")
-    two = data_card.make_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
+    two = data_card.rendered_card(config_of(), 10, {1: tug}, Assets(photos=(str(tmp_path / "a.jpg"),)))["backgrounds"]
     assert one["photos"] == two["photos"] == 1
     assert one["sha256"] != two["sha256"]
 
@@ -36,38 +33,10 @@ def test_photographs_are_in_the_card_by_content(config_of, tug, tmp_path):
 @pytest.mark.parametrize("scale", [0.25, 3.0])  # 3 cm and 36 cm
 def test_any_size_of_object_fits_the_defaults(config_of, tug, scale):
     mesh = Mesh(vertices_m=tug.vertices_m * scale, faces=tug.faces, normals=tug.normals, vertex_rgb=tug.vertex_rgb)
-    card = data_card.make_card(config_of(), 1, {1: mesh}, Assets())
-    plain = data_card.make_card(config_of(), 1, {1: tug}, Assets())
+    card = data_card.rendered_card(config_of(), 1, {1: mesh}, Assets())
+    plain = data_card.rendered_card(config_of(), 1, {1: tug}, Assets())
     side = [c["objects"]["1"]["window_side_px"] for c in (card, plain)]
     assert side[0] == pytest.approx(side[1])
-
-
-def test_symmetries_are_found_by_name_or_id(tug, tmp_path):
-    entry = {"diameter": 118.9, "symmetries_discrete": [[-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]]}
-    for key in ("tug", "1"):
-        file = tmp_path / "models_info.json"
-        file.write_text(json.dumps({key: entry}))
-        infos = data_card.load_symmetries(str(file), {1: tug})
-        assert len(infos[1].symmetries_discrete) == 1
-        files = data_card.model_files({1: tug}, infos)
-        assert sorted(files) == ["models/models_info.json", "models/obj_000001.ply"]
-        assert "symmetries_discrete" in json.loads(files["models/models_info.json"])["1"]
-    file.write_text(json.dumps({"cup": entry}))
-    with pytest.raises(DatasetError, match="cup"):
-        data_card.load_symmetries(str(file), {1: replace(tug, path="tug.ply")})
-    file.write_text(json.dumps({"5": entry}))  # another dataset's numbers: no symmetry may get lost in silence
-    with pytest.raises(DatasetError, match="no entry for 1, tug; its keys are 5"):
-        data_card.load_symmetries(str(file), {1: tug})
-    with pytest.raises(DatasetError, match="cannot be read"):
-        data_card.load_symmetries(str(tmp_path / "none.json"), {1: tug})
-
-
-def test_object_ids_follow_bop_names_or_the_order():
-    assert object_ids(["a.ply", "b.ply"]) == [1, 2]
-    assert object_ids(["x/obj_000009.ply", "obj_000002.ply"]) == [9, 2]
-    assert object_ids(["obj_000009.ply", "b.ply"]) == [1, 2]
-    with pytest.raises(ConfigError, match="object id 3"):
-        object_ids(["a/obj_000003.ply", "b/obj_000003.ply"])
 
 
 @pytest.mark.parametrize(("diameter_m", "step_m"), [(0.03, 1e-4), (0.12, 1e-4), (2.0, 8e-4)])
@@ -79,6 +48,6 @@ def test_depth_of_large_objects_fits_in_coarser_steps(diameter_m, step_m):
         faces=np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
         normals=np.tile(np.array([0, 0, 1], np.float32), (4, 1)),
     )
-    card = data_card.make_card(load_config("default"), 8, {1: mesh}, Assets())
+    card = data_card.rendered_card(load_config("default"), 8, {1: mesh}, Assets())
     assert card["depth_step_m"] == pytest.approx(step_m)
     assert card["depth_step_m"] * 65535 > 14 * diameter_m

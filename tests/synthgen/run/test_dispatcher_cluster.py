@@ -161,10 +161,10 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
 
 def test_a_worker_says_why_it_cannot_render(tug, config_of):
     job = ShardJob(config=config_of(), card={}, meshes={1: tug})
-    assert worker.problem_with(job, 1) is None
-    assert "has 4 threads, expected 1" in worker.problem_with(job, 4)
+    assert worker.find_problem(job, 1) is None
+    assert "has 4 threads, expected 1" in worker.find_problem(job, 4)
     lost = replace(job, assets=Assets(photos=("/nowhere/a.png", "/nowhere/b.png")))
-    assert "cannot read /nowhere/a.png (2 of 2 photographs" in worker.problem_with(lost, 1)
+    assert "cannot read /nowhere/a.png (2 of 2 photographs" in worker.find_problem(lost, 1)
 
 
 def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, tug_ply, small_set, monkeypatch):

@@ -89,7 +89,7 @@ def with_renderer(renderer, monkeypatch, **attributes):
 @pytest.fixture
 def job_and_writer(tmp_path, tug, config_of):
     config = config_of()
-    writer = ShardWriter.create(str(tmp_path / "shards"), data_card.make_card(config, N, {1: tug}, Assets()))
+    writer = ShardWriter.create(str(tmp_path / "shards"), data_card.rendered_card(config, N, {1: tug}, Assets()))
     return ShardJob(config=config, card=writer.card, meshes={1: tug}, threads=1), writer
 
 

@@ -1,7 +1,10 @@
-"""Estimates come from real renders, and a disk without room is refused before anything is written."""
+"""Estimates come from real renders."""
+
+import os
+import time
 
 import pytest
-from posecore.errors import PoseError, StorageError
+from posecore.errors import PoseError, RenderError
 from posecore.mesh import load_mesh
 from posecore.shard import ShardReader
 from small_datasets import write_dataset
@@ -15,35 +18,34 @@ from synthgen.run.shard_job import ShardJob
 def job_of(config_of, tug_ply):
     def make(n, *overrides):
         config, meshes = config_of(*overrides), {1: load_mesh(tug_ply)}
-        return ShardJob(config=config, card=data_card.make_card(config, n, meshes, Assets()), meshes=meshes)
+        return ShardJob(config=config, card=data_card.rendered_card(config, n, meshes, Assets()), meshes=meshes)
 
     return make
 
 
 def test_the_estimate_is_near_what_a_dataset_takes(job_of, tmp_path):
     job = job_of(16, "shard_size=8")
-    found = estimate.estimate(job, scenes=3)
-    assert found.pairs == 8 and found.seconds_per_pair > 0
+    measured = estimate.estimate(job, scenes=3)
+    assert measured.pairs == 8 and measured.seconds_per_pair > 0
     write_dataset(tmp_path / "d", job.config, job.meshes, 16)
     reader = ShardReader(str(tmp_path / "d"))
     real = sum(sum(line["bytes"].values()) for line in reader._lines.values())
-    assert found.bytes(16) == pytest.approx(real, rel=0.5)
-    assert found.seconds(1000, 4) == pytest.approx(250 * found.seconds_per_pair)
+    assert measured.size_bytes(16) == pytest.approx(real, rel=0.5)
+    assert measured.duration_s(1000, 4) == pytest.approx(250 * measured.seconds_per_pair)
 
 
 def test_the_last_shard_alone_is_enough(job_of):
-    assert estimate.measured(job_of(1), 4, 5.0).pairs == 2  # one scene of one sample, rendered twice
+    assert estimate.measure_scenes(job_of(1), 4, 5.0).pairs == 2  # one scene of one sample, rendered twice
 
 
-def test_what_cannot_be_rendered_is_said_by_the_estimate(job_of):
+def test_settings_that_cannot_be_rendered_fail_the_estimate(job_of):
     job = job_of(8, "window.min_area_px=2000")
     with pytest.raises(PoseError, match="scene 0"):
         estimate.estimate(job)
 
 
-def test_a_disk_without_room_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(estimate, "free_bytes", lambda path: 10**9)
-    estimate.check_free_space(str(tmp_path / "d"), 10**8)
-    estimate.check_free_space("s3://bucket/d", 10**15)
-    with pytest.raises(StorageError, match=r"d: 1 GB free, about 1.27 GB needed; free some space, choose another"):
-        estimate.check_free_space(str(tmp_path / "d"), 10**9)
+def test_a_process_that_dies_or_hangs_is_one_line():
+    with pytest.raises(RenderError, match="the renderer died at the first scenes, exit code -6"):
+        estimate.in_own_process(os.abort, timeout_s=60)
+    with pytest.raises(RenderError, match="gave no result in 0 s"):
+        estimate.in_own_process(time.sleep, 60, timeout_s=0.2)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 from posecore.errors import StorageError
+from synthgen import lock
 from synthgen.engines.blender import scratch
-from synthgen.run import lock
 
 
 def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):
@@ -25,7 +25,7 @@ def test_a_folder_is_held_once_and_nothing_is_left_in_it(tmp_path):
 
 
 def test_the_lock_goes_with_a_killed_process(tmp_path):
-    code = f"import os\nfrom synthgen.run import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
+    code = f"import os\nfrom synthgen import lock\nwith lock.held({str(tmp_path)!r}):\n os.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
     with lock.held(str(tmp_path)):
         pass

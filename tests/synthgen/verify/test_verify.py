@@ -17,7 +17,7 @@ from posecore.shard import ShardReader, ShardWriter
 from small_datasets import write_dataset
 from synthgen.cli import main
 from synthgen.verify import checks, coverage
-from synthgen.verify.facts import Batch, load_facts
+from synthgen.verify.facts import SampleBatch, load_facts
 from synthgen.verify.findings import DATASET_CHECKS
 from synthgen.verify.page import report_page
 from synthgen.verify.verify import verify
@@ -56,13 +56,13 @@ def test_a_sound_dataset_passes_every_check_on_every_sample(sound):
     assert [f.name for f in report.findings if not f.ok] == []
     names = {f.name for f in report.findings}
     assert names == {*DATASET_CHECKS, *(c.name for c in checks.CHECKS)}
-    assert {f.covered for f in report.findings if f.of == "samples"} == {N}
-    assert report.drawn == N
+    assert {f.covered for f in report.findings if f.items == "samples"} == {N}
+    assert report.rerendered == N
     assert report.gl
     assert (report.coverage["visible_fraction"] < 1).any(), "no occlusion: the checks of hidden parts saw nothing"
 
 
-def turned(values):
+def rotated(values):
     T = values["T_cam_obj"][1]
     T[:3, :3] = T[:3, :3] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     for i in (0, 1):  # both samples of the scene, so that only the picture contradicts the pose
@@ -70,14 +70,14 @@ def turned(values):
 
 
 def half_a_degree(values):
-    """A pose that no eye sees to be wrong."""
-    turn = rotation_from_rotvec(np.array([np.deg2rad(0.5), 0.0, 0.0]))
+    """A pose error that is invisible to the eye."""
+    R = rotation_from_rotvec(np.array([np.deg2rad(0.5), 0.0, 0.0]))
     T = values["T_cam_obj"][1]
-    T[:3, :3] = turn @ T[:3, :3]
+    T[:3, :3] = R @ T[:3, :3]
     values["T_cam_obj"][0] = T
 
 
-def far(values):
+def five_times_as_far(values):
     values["T_cam_obj"][:2, :3, 3] *= 5
     values["T_cam_obj_hypothesis"][:2, :3, 3] *= 5
 
@@ -90,9 +90,9 @@ def swapped_labels(values):
     values["hypothesis_depth_m"][1] = np.fliplr(values["hypothesis_depth_m"][1])
 
 
-def item(name, place, value):
+def item(name, index, value):
     def mutate(values):
-        values[name][(1, *place)] = value
+        values[name][(1, *index)] = value
 
     return mutate
 
@@ -120,7 +120,7 @@ def replaced(name, value):
 
 
 def hidden_contour_moved(values):
-    """Points on the hidden part of the true contour: no stored depth contradicts them, only the mesh does."""
+    """Points on the hidden part of the ground-truth contour: only the mesh contradicts them, no stored depth does."""
     values["scene_contour_cam_m"][1] *= np.float32(1.01)
 
 
@@ -128,7 +128,7 @@ def one_wrong_scene(values):
     values["scene_index"][1] += 1
 
 
-def twin(values):
+def copied(values):
     for value in values.values():
         value[1] = value[0]
 
@@ -145,8 +145,8 @@ DAMAGE = [
     ("camera", shifted("K_crop", [[0, 0, 0.01], [0, 0, 0], [0, 0, 0]])),
     ("object", replaced("obj_id", 3)),
     ("window", shifted("window_px", [1.0, 0.0, 0.0])),
-    ("distance", far),
-    ("angle", turned),
+    ("distance", five_times_as_far),
+    ("angle", rotated),
     ("translation", moved_hypothesis),
     ("scene", one_wrong_scene),
     ("scene", shifted("T_cam_obj", [[0, 0, 0, 1e-9], [0] * 4, [0] * 4, [0] * 4])),
@@ -162,14 +162,14 @@ DAMAGE = [
     ("distance values", item("hypothesis_distance_px", (0, 0), 60)),
     ("contour pixels", shifted("hypothesis_contour_cam_m", [0.002, 0.0, 0.0])),
     ("contour depth", deeper("hypothesis_depth_m", 0.0005)),
-    ("vertices", turned),
-    ("truth drawn again", turned),
-    ("hypothesis drawn again", swapped_labels),
-    ("scene depth drawn again", deeper("scene_depth_m", 0.0005)),
-    ("scene depth drawn again", half_a_degree),
-    ("hypothesis depth drawn again", deeper("hypothesis_depth_m", 0.0005)),
+    ("vertices", rotated),
+    ("ground truth re-rendered", rotated),
+    ("hypothesis re-rendered", swapped_labels),
+    ("scene depth re-rendered", deeper("scene_depth_m", 0.0005)),
+    ("scene depth re-rendered", half_a_degree),
+    ("hypothesis depth re-rendered", deeper("hypothesis_depth_m", 0.0005)),
     ("contour on surface", hidden_contour_moved),
-    ("duplicates", twin),
+    ("duplicates", copied),
 ]
 
 
@@ -207,7 +207,7 @@ def test_changed_bytes_fail_the_checksum_and_the_rest_is_still_checked(copy):
     assert "shard" in failed["checksums"].note
     file.unlink()
     assert list(failures(copy)) == ["checksums"]
-    assert "Samples drawn at random" in report_page(verify(str(copy)))  # the page leaves that shard's samples out
+    assert "Random samples" in report_page(verify(str(copy)))  # the page leaves that shard's samples out
 
 
 def test_a_wrong_line_of_the_manifest_is_found(copy):
@@ -243,15 +243,15 @@ def test_a_card_without_what_checks_need_is_one_line(copy):
     group = json.loads((copy / "zarr.json").read_text())
     del group["attributes"]["config"]["perturbation"]
     (copy / "zarr.json").write_text(json.dumps(group))
-    with pytest.raises(ShardError, match=r"the data card lacks what .* write .*perturbation"):
+    with pytest.raises(ShardError, match=r"the data card lacks entries that .* write .*perturbation"):
         verify(str(copy))
 
 
-def test_only_the_drawn_samples_are_drawn_again_and_the_seed_decides_which(sound):
+def test_only_the_chosen_samples_are_rerendered_and_the_seed_decides_which(sound):
     report = verify(str(sound), samples=3, seed=1)
     covered = {c.name: f.covered for c in checks.CHECKS for f in report.findings if f.name == c.name}
-    assert {covered[c.name] for c in checks.CHECKS if c.drawn} == {3}
-    assert {covered[c.name] for c in checks.CHECKS if not c.drawn} == {N}
+    assert {covered[c.name] for c in checks.CHECKS if c.rerendered} == {3}
+    assert {covered[c.name] for c in checks.CHECKS if not c.rerendered} == {N}
     none = verify(str(sound), samples=0)
     assert none.gl is None
     assert none.ok
@@ -269,23 +269,23 @@ def test_a_dataset_in_an_object_store(config_of, tug, tmp_path):
     assert verify(url, workers=4).ok
 
 
-def test_the_command_says_what_fails_and_how_much_was_looked_at(copy, tmp_path):
+def test_the_command_reports_failures_and_the_number_of_checked_samples(copy, tmp_path):
     page, findings = tmp_path / "report.html", tmp_path / "findings.json"
     arguments = ["verify", str(copy), "--workers", "1", "--quiet", "--report", str(page), "--json", str(findings)]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     assert len(result.stdout.splitlines()) == len(checks.CHECKS) + len(DATASET_CHECKS) + 1
-    assert f"{N} of {N} samples are there and were read, {N} of them drawn again" in result.stdout
+    assert f"{N} of {N} samples are committed and were read, {N} were re-rendered" in result.stdout
     change(copy, swapped_labels)
     result = CliRunner().invoke(main, [*arguments, "--samples", "9"])
     assert result.exit_code == 1
     assert "Error: " in result.stderr and "distance zeros" in result.stderr
-    assert "9 of them drawn again" in result.stdout
-    found = json.loads(findings.read_text())
-    assert not found["ok"]
-    zeros = next(c for c in found["checks"] if c["name"] == "distance zeros")
+    assert "9 were re-rendered" in result.stdout
+    content = json.loads(findings.read_text())
+    assert not content["ok"]
+    zeros = next(c for c in content["checks"] if c["name"] == "distance zeros")
     assert (zeros["covered"], zeros["failed"], zeros["first"]) == (N, 1, [BAD])
-    assert sum(found["coverage"]["samples_by_object"].values()) == N
+    assert sum(content["coverage"]["samples_by_object"].values()) == N
     text = page.read_text()
     assert "Failed samples" in text
     assert text.count("<svg") == text.count('role="img"') >= 8
@@ -300,7 +300,7 @@ def test_a_folder_without_a_dataset_is_one_line(tmp_path):
         assert result.stderr.count("Error: ") == 1 and "no shard dataset" in result.stderr
 
 
-def test_nothing_rendered_yet_is_said(config_of, tug, tmp_path):
+def test_a_dataset_without_shards_is_refused(config_of, tug, tmp_path):
     write_dataset(tmp_path / "d", config_of(), {1: tug}, 4, shards=0)
     with pytest.raises(ShardError, match="no shard is rendered yet"):
         verify(str(tmp_path / "d"))
@@ -325,11 +325,11 @@ def test_the_view_is_the_cameras_direction_in_the_objects_frame(sound):
     reader = ShardReader(str(sound))
     values = reader.read(0)
     facts = load_facts(reader)
-    found = coverage.coverage_of(Batch(values, np.arange(4), facts))
+    numbers = coverage.measure_coverage(SampleBatch(values, np.arange(4), facts))
     for i in range(4):
         T = values["T_cam_obj"][i]
         camera_obj = np.linalg.inv(T)[:3, 3] - facts.meshes[int(values["obj_id"][i])].center_m
-        np.testing.assert_allclose(found["view"][i], camera_obj / np.linalg.norm(camera_obj), atol=1e-9)
+        np.testing.assert_allclose(numbers["view"][i], camera_obj / np.linalg.norm(camera_obj), atol=1e-9)
 
 
 def test_the_documentation_has_every_check(repository):

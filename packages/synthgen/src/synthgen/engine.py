@@ -1,8 +1,8 @@
-"""The contract that every rendering engine keeps."""
+"""Contract of the rendering engines."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Int16
@@ -10,23 +10,16 @@ from posecore.mesh import Mesh
 
 from synthgen.scene import Scene
 
-EngineName = Literal["cycles", "eevee", "raster"]
-Device = Literal["auto", "cpu", "cuda", "optix"]
-
-ENGINE_NAMES: tuple[str, ...] = get_args(EngineName)
-GPU_DEVICES: tuple[Device, ...] = ("optix", "cuda")
-"""What 'auto' takes, the fastest first; without either it takes the CPU."""
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RenderedScene:
-    """The layers of one rendered region; row 0 is the top.
+    """Layers of a rendered region; row 0 is the top.
 
     Attributes:
         rgb_linear: (h, w, 3) linear scene radiance, straight (not multiplied by alpha); 0 where alpha is 0.
         alpha: (h, w) coverage of the pixel in [0, 1], antialiased.
-        depth_m: (h, w) camera z of the surface at the pixel's centre, 0 where there is none.
-        index: (h, w) position in `Scene.objects` of the surface at the pixel's centre, -1 where there is none.
+        depth_m: (h, w) camera z of the surface at the pixel's centre, 0 for background.
+        index: (h, w) position in `Scene.objects` of the surface at the pixel's centre, -1 for background.
             `index >= 0` exactly where `depth_m > 0`.
     """
 
@@ -38,12 +31,12 @@ class RenderedScene:
 
 @runtime_checkable
 class Engine(Protocol):
-    """Turns scenes into layers. One engine serves one process, for as many scenes as wanted."""
+    """Renders scenes to layers. An engine lives in a single process and renders any number of scenes."""
 
     name: str
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make the meshes known under their keys; a key that is known already is replaced.
+        """Load meshes under their keys; a mesh with a loaded key replaces the earlier mesh.
 
         Raises:
             MeshError: The engine cannot take a mesh.
@@ -55,8 +48,8 @@ class Engine(Protocol):
         The result depends on the scene and the loaded meshes alone: not on earlier scenes or the number of threads.
 
         Raises:
-            RenderError: A mesh key is unknown or the renderer failed.
+            RenderError: A mesh key is not loaded, or the renderer failed.
         """
 
     def close(self) -> None:
-        """Free what the engine holds. Closing twice does nothing."""
+        """Release the engine's resources. Closing twice does nothing."""

@@ -1,19 +1,22 @@
-"""What the machine gives to this process: cores, memory, disk, shared memory."""
+"""Resources of the machine for this process: cores, memory, disk, shared memory."""
 
 import os
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from posecore.errors import StorageError
+
 _CGROUP = Path("/sys/fs/cgroup")
+_SPARE_BYTES = 256 * 2**20  # left free on the disk
 
 
 @dataclass(frozen=True, kw_only=True)
 class Machine:
-    """What may be used here.
+    """Available resources.
 
     Attributes:
-        cores: Cores that this process may run on.
+        cores: Number of cores for this process.
         cpu: Name of the processor.
         memory_bytes: Memory, or the container's limit where that is less.
         shared_bytes: Size of /dev/shm, 0 without one.
@@ -26,7 +29,7 @@ class Machine:
 
 
 def machine() -> Machine:
-    """Look at this machine."""
+    """Resources of this machine."""
     return Machine(
         cores=min(float(cores()), _cgroup_cores()),
         cpu=_cpu_name(),
@@ -36,7 +39,7 @@ def machine() -> Machine:
 
 
 def cores() -> int:
-    """Cores that this process may be scheduled on."""
+    """Number of cores that this process may be scheduled on."""
     return len(os.sched_getaffinity(0))
 
 
@@ -48,15 +51,35 @@ def memory_bytes() -> int:
 
 
 def free_bytes(path: Path) -> int:
-    """Free space where a folder is, or would be made."""
-    place = path.absolute()
-    while not place.exists():
-        place = place.parent
-    return shutil.disk_usage(place).free
+    """Free space on the disk of a folder, or of its nearest existing parent."""
+    folder = path.absolute()
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free
+
+
+def require_free_space(url: str, needed_bytes: int) -> None:
+    """Check that the disk of a folder, or of its nearest existing parent, has room; URLs are not checked.
+
+    Args:
+        url: Dataset.
+        needed_bytes: Bytes still to be written there.
+
+    Raises:
+        StorageError: Less is free than needed; the message names both and the remedies.
+    """
+    if "://" in url:
+        return
+    free = free_bytes(Path(url))
+    if free < needed_bytes + _SPARE_BYTES:
+        raise StorageError(
+            f"{url}: {size_text(free)} free, about {size_text(needed_bytes + _SPARE_BYTES)} needed; free some space, "
+            "choose another --out, or a smaller --n"
+        )
 
 
 def _cgroup_cores() -> float:
-    """Cores' worth of time that the control group grants, infinite without a limit."""
+    """CPU quota of the control group in cores, infinite without a limit."""
     words = _text(_CGROUP / "cpu.max").split()
     if len(words) == 2 and words[0] != "max":
         return int(words[0]) / int(words[1])

@@ -28,6 +28,7 @@ from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh
 from posecore.processes import behave_as_worker, map_unordered
 
+from synthgen import lock
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig, migrate
 from synthgen.draw.target import TargetObject, make_targets
@@ -35,7 +36,6 @@ from synthgen.engines.blender.paths import forget_blenders_paths
 from synthgen.inputs.assets import Assets
 from synthgen.pairs.data_card import versions
 from synthgen.pairs.pair_maker import limit_threads
-from synthgen.run import lock
 
 CARD = "synthgen.json"
 _MAX_DEPTH_STEP = 65535

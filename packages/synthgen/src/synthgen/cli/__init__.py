@@ -1,4 +1,4 @@
-"""The `synthgen` command: render training pairs, render BOP frames, look at what was rendered."""
+"""The `synthgen` command: render training pairs and BOP images, verify and inspect datasets."""
 
 import click
 from posecore.command_line import CONTEXT_SETTINGS, ErrorReportingGroup

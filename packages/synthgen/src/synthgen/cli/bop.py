@@ -14,7 +14,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @scene_options
-@click.option("--frames", required=True, type=click.IntRange(1), help="Number of images; of each sequence.")
+@click.option(
+    "--frames", required=True, type=click.IntRange(1), help="Number of images; with --sequence, per sequence."
+)
 @click.option(
     "--objects-per-frame",
     nargs=2,
@@ -25,19 +27,19 @@ if TYPE_CHECKING:
 @click.option(
     "--frames-per-scene",
     type=click.IntRange(1),
-    help="Images from as many cameras that share what stands there: a BOP scene each, 000000 on. [every image has a "
-    "layout of its own, all in scene 000001]",
+    help="Images per layout, each from another camera: a layout is a BOP scene, 000000 on. [every image has its own "
+    "layout, all in scene 000001]",
 )
 @click.option(
     "--split",
     type=click.Choice(["test", "val", "train_pbr"]),
     default="test",
     show_default=True,
-    help="BOP split. train_pbr has JPEG images and no targets file, as BOP's own. Splits never share a scene.",
+    help="BOP split. train_pbr has JPEG images and no targets file, as in BOP. Splits have no common scene.",
 )
 @click.option("--sequence", is_flag=True, help="Smooth tracking sequences instead of single images.")
 @click.option("--sequences", type=click.IntRange(1), help="Number of sequences, scenes 000001 on. [1 with --sequence]")
-@click.option("--fps", type=click.FloatRange(0.1), help="Images a second of sequences. [preset, 30]")
+@click.option("--fps", type=click.FloatRange(0.1), help="Images per second of sequences. [preset, 30]")
 @click.option("--workers", type=click.IntRange(1), default=1, show_default=True, help="Processes that render.")
 def bop(
     sources: "Sources",
@@ -57,9 +59,9 @@ def bop(
 ) -> None:
     """Render whole camera images, or tracking sequences, with ground truth as a BOP dataset.
 
-    The images follow the same preset as training pairs, but are other scenes. Stopping it at any moment, also with kill
-    -9, loses only the images in flight; the same command again continues and ends with the same bytes, with any number
-    of workers.
+    The images follow the same preset as training pairs, but show other scenes. A stop at any moment, even kill -9,
+    loses only the images in progress; the same command again continues and ends with the same bytes, with any number of
+    workers.
 
     \b
     synthgen bop --object mesh.ply --frames 50 --out test_bop
@@ -70,36 +72,25 @@ def bop(
     """
     from posecore.errors import ConfigError
 
-    from synthgen.bop import dataset_writer
     from synthgen.bop.frame_maker import FramePlan
     from synthgen.config import load_config
+    from synthgen.run.bop import BopJob, render_bop_dataset
 
     if not sequence and (sequences is not None or fps is not None):
-        raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: only sequences have it; add --sequence")
+        raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: is for sequences alone; add --sequence")
     if objects_per_frame is not None:
         overrides = (*overrides, f"frames.objects=[{objects_per_frame[0]}, {objects_per_frame[1]}]")
     if fps is not None:
         overrides = (*overrides, f"sequence.fps={fps}")
-    config = load_config(preset, overrides, values)
     plan = FramePlan(
         split=split,
         frames=frames,
         frames_per_scene=frames_per_scene,
         sequences=(sequences or 1) if sequence else None,
     )
-    meshes, assets = sources.meshes(), sources.assets()
-    infos = sources.infos(meshes)
-    total = sum(count for _, count in plan.scenes())
+    config = load_config(preset, overrides, values)
+    job = BopJob(out=out, plan=plan, config=config, sources=sources, workers=workers)
     with resumable(out), progress_bar(quiet) as bar:
-        task = bar.add_task("frames", total=total)
-        dataset_writer.write_dataset(
-            out,
-            config,
-            meshes,
-            plan,
-            assets=assets,
-            infos=infos,
-            workers=workers,
-            on_frame=lambda scene_id, im_id: bar.advance(task),
-        )
-    click.echo(f"{out}: complete, {total} frames", err=True)
+        task = bar.add_task("frames", total=job.frames)
+        summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.advance(task))
+    click.echo(summary.text, err=True)

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
-from synthgen.cli.options import ENGINES
+from synthgen.cli.options import ENGINE, UNITS
 
 if TYPE_CHECKING:
     from posecore.mesh import Units
+
+    from synthgen.names import EngineName
 
 
 @click.command()
@@ -18,16 +20,16 @@ if TYPE_CHECKING:
     "--engine",
     "engines",
     multiple=True,
-    type=click.Choice(ENGINES),
-    help="Renderer to measure, and what must work. Repeatable. [all that work; eevee only on a GPU]",
+    type=ENGINE,
+    help="Renderer that must work and is measured. Repeatable. [every one that works; eevee only on a GPU]",
 )
 @click.option(
-    "--seconds", type=click.FloatRange(0), default=30.0, help="Time to measure, shared by the engines; 0: none."
+    "--seconds", type=click.FloatRange(0), default=30.0, help="Measuring time, divided between the engines; 0: none."
 )
 @click.option(
     "--object", "mesh", type=click.Path(path_type=Path), metavar="MESH", help="Object to measure with. [a simple one]"
 )
-@click.option("--units", type=click.Choice(["mm", "cm", "m"]), default="mm", help="Unit of the mesh's coordinates.")
+@click.option("--units", type=UNITS, default="mm", help="Unit of the mesh's coordinates.")
 @click.option("--preset", default="default", metavar="NAME|FILE", help="Preset to measure with.")
 @click.option(
     "--set",
@@ -41,12 +43,12 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     default=Path(),
     metavar="DIR",
-    help="Where the dataset would go, for its disk.",
+    help="Folder of the planned dataset, for its disk.",
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON object instead of a table.")
 def doctor(
     n: int,
-    engines: tuple[str, ...],
+    engines: "tuple[EngineName, ...]",
     seconds: float,
     mesh: Path | None,
     units: "Units",
@@ -55,35 +57,23 @@ def doctor(
     out: Path,
     as_json: bool,
 ) -> None:
-    """Say what this machine has of what rendering needs, and how long N pairs will take here.
+    """Check this machine for rendering, and measure how long N pairs will take here.
 
-    Looks at Blender, GL, GPUs, cores, memory and disk, then runs the real command with its default workers for half a
-    minute into a temporary folder. Exit code 1 when something that is needed is missing.
+    Checks Blender, GL, GPUs, cores, memory and disk, then renders with the default workers for half a minute into a
+    temporary folder. Exit code 1 when a requirement is missing.
 
     \b
     synthgen doctor
     synthgen doctor --n 50000 --object mesh.ply --preset quickstart --engine cycles --out shards
     synthgen doctor --seconds 0 --json
     """
-    from posecore.mesh import load_mesh
-
     from synthgen.config import load_config
-    from synthgen.inspect import doctor as doctoring
-    from synthgen.inspect.speed import measure
+    from synthgen.inspect.doctor import DoctorJob, diagnose
 
     config = load_config(preset, overrides)
-    if mesh is not None:
-        load_mesh(mesh, units=units)
-    found, able = doctoring.look(out, engines)
-    chosen = tuple(name for name in (engines or able.worth_measuring()) if name in able.names) if seconds else ()
-    arguments = ["--preset", preset, *(word for key in overrides for word in ("--set", key))]
-    speeds = []
-    for engine in chosen:
-        click.echo(f"measuring {engine} for {seconds / len(chosen):.0f} s ...", err=True)
-        speeds.append(measure(engine, config, arguments, seconds / len(chosen), mesh, units))
-    found += doctoring.disk_found(speeds, n, out)
-    click.echo((doctoring.as_json if as_json else doctoring.as_text)(found, speeds, n))
-    missing = [item.name for item in found if item.state == "missing"] + [s.engine for s in speeds if not s.pairs]
-    if missing:
-        click.echo(f"Error: missing here: {', '.join(missing)}", err=True)
+    job = DoctorJob(config=config, n=n, engines=engines, seconds=seconds, mesh=mesh, units=units, out=out)
+    report = diagnose(job, lambda engine, time_s: click.echo(f"measuring {engine} for {time_s:.0f} s ...", err=True))
+    click.echo(report.as_json() if as_json else report.as_text())
+    if report.missing:
+        click.echo(f"Error: missing here: {', '.join(report.missing)}", err=True)
         sys.exit(1)

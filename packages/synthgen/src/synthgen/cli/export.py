@@ -1,9 +1,15 @@
 """`synthgen export`."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from posecore.command_line import progress_bar
+
+from synthgen.cli.options import QUIET
+
+if TYPE_CHECKING:
+    from synthgen.pairs.export import Layout
 
 
 @click.command()
@@ -17,25 +23,27 @@ from posecore.command_line import progress_bar
     help="One HDF5 file in the manner of BlenderProc's, or a folder of tars.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace OUT where it exists.")
-@click.option("--quiet", is_flag=True, help="No progress bar.")
-def export(shards: str, out: Path, layout: str, overwrite: bool, quiet: bool) -> None:
+@QUIET
+def export(shards: str, out: Path, layout: "Layout", overwrite: bool, quiet: bool) -> None:
     """Write a complete dataset of SHARDS (folder or URL) as OUT in another container.
 
-    OUT appears when it is complete. Every value is the one that the shards hold.
+    OUT appears when it is complete. Values are exactly those of the shards.
 
     \b
     synthgen export shards out.h5
     synthgen export shards tars --format webdataset
     synthgen export s3://bucket/shards out.h5 --overwrite
     """
-    from posecore.shard import ShardReader
+    from synthgen.pairs.export import export_dataset
 
-    from synthgen.pairs.export import refuse_existing, to_hdf5, to_webdataset
-
-    refuse_existing(out, overwrite)
-    n = ShardReader(shards).n
     with progress_bar(quiet) as bar:
-        task = bar.add_task("pairs", total=n)
-        write = to_hdf5 if layout == "hdf5" else to_webdataset
-        write(shards, out, overwrite=overwrite, on_shard=lambda count: bar.advance(task, count))
-    click.echo(f"{out}: {n} pairs", err=True)
+        task = bar.add_task("pairs", visible=False)
+        pairs = export_dataset(
+            shards,
+            out,
+            layout,
+            overwrite=overwrite,
+            on_start=lambda total: bar.reset(task, total=total, visible=True),
+            on_shard=lambda count: bar.advance(task, count),
+        )
+    click.echo(f"{out}: {pairs} pairs", err=True)

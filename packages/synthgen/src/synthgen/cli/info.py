@@ -7,7 +7,7 @@ import click
 @click.argument("dataset", type=str)
 @click.option("--json", "as_json", is_flag=True, help="One JSON object instead of text.")
 def info(dataset: str, as_json: bool) -> None:
-    """Say what a DATASET holds and how it was made: folder or URL of shards, or a folder of `synthgen bop`.
+    """Summarise the content and the settings of a DATASET: folder or URL of shards, or a folder of `synthgen bop`.
 
     \b
     synthgen info shards
@@ -17,5 +17,5 @@ def info(dataset: str, as_json: bool) -> None:
 
     from synthgen.inspect.info import dataset_info, info_text
 
-    found = dataset_info(dataset)
-    click.echo(json.dumps(found, indent=1) if as_json else info_text(found))
+    content = dataset_info(dataset)
+    click.echo(json.dumps(content, indent=1) if as_json else info_text(content))

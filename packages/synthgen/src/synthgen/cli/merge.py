@@ -3,18 +3,18 @@
 import click
 from posecore.command_line import progress_bar
 
-from synthgen.cli.options import resumable
+from synthgen.cli.options import OUT, QUIET, resumable
 
 
 @click.command()
 @click.argument("datasets", nargs=-1, required=True, metavar="DATASET DATASET...")
-@click.option("--out", required=True, type=str, metavar="DIR", help="Where to. The same command again continues it.")
-@click.option("--quiet", is_flag=True, help="No progress bar.")
+@OUT
+@QUIET
 def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
-    """Write complete shard DATASETs (folders or URLs) as one, to train on all of them.
+    """Merge complete shard DATASETs (folders or URLs) into a single one for training.
 
-    Patches, contour points and the meshes of objects that several of them have must be the same. Scenes are numbered
-    on: none of one dataset is taken for one of another when scenes are held out.
+    All must have equal patches and numbers of contour points, and equal meshes of common objects. Scenes are
+    renumbered: scenes of different datasets keep different numbers, since validation holds out whole scenes.
 
     \b
     synthgen merge rendered real --out both
@@ -22,15 +22,14 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
     """
     if len(datasets) < 2:
         raise click.UsageError("give two datasets or more")
-    from posecore.shard import ShardWriter
+    from synthgen.pairs.merge import merge_datasets
 
-    from synthgen.pairs.merge import merged_card, open_parts, write_merged
-    from synthgen.run import lock
-
-    parts = open_parts(datasets)
-    card = merged_card(parts)
-    with lock.held(out), resumable(out), progress_bar(quiet) as bar:
-        writer = ShardWriter.create(out, card)
-        task = bar.add_task("pairs", total=card["n"])
-        write_merged(parts, writer, lambda count: bar.advance(task, count))
-    click.echo(f"{out}: complete, {card['n']} pairs of {len(parts)} datasets", err=True)
+    with resumable(out), progress_bar(quiet) as bar:
+        task = bar.add_task("pairs", visible=False)
+        pairs = merge_datasets(
+            datasets,
+            out,
+            on_start=lambda total: bar.reset(task, total=total, visible=True),
+            on_shard=lambda count: bar.advance(task, count),
+        )
+    click.echo(f"{out}: complete, {pairs} pairs of {len(datasets)} datasets", err=True)

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import click
-from posecore.errors import ConfigError
 
 
 @click.command()
@@ -18,15 +17,7 @@ def preview(dataset: str, out: Path, count: int, first: int) -> None:
     synthgen preview shards --out sheet.png
     synthgen preview shards --out sheet.png --count 20 --first 1000
     """
-    import cv2
-    from posecore.files import write_atomic
+    from synthgen.inspect.preview import save_contact_sheet
 
-    from synthgen.inspect.preview import contact_sheet
-
-    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise ConfigError(f"--out {out}: expected a .png or .jpg file")
-    sheet = contact_sheet(dataset, count, first=first)
-    ok, data = cv2.imencode(out.suffix, sheet[..., ::-1])
-    assert ok
-    write_atomic(out, data.tobytes())
-    click.echo(f"{out}: {sheet.shape[1]} x {sheet.shape[0]} px", err=True)
+    width_px, height_px = save_contact_sheet(dataset, out, count, first=first)
+    click.echo(f"{out}: {width_px} x {height_px} px", err=True)

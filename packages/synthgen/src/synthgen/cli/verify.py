@@ -2,13 +2,11 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 from posecore.command_line import progress_bar
 
-if TYPE_CHECKING:
-    from synthgen.verify.findings import Finding, Report
+from synthgen.cli.options import QUIET
 
 
 @click.command()
@@ -17,31 +15,39 @@ if TYPE_CHECKING:
     "--samples",
     type=click.IntRange(0),
     default=5000,
-    help="Samples to draw again and compare, chosen at random; every sample is read and checked for the rest.",
+    help="Samples to re-render and compare, chosen at random; all other checks cover every sample.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, help="Decides which samples are drawn again.")
-@click.option("--allow-incomplete", is_flag=True, help="Missing shards are no failure: the dataset is still growing.")
-@click.option("--report", type=click.Path(path_type=Path), metavar="FILE", help="Write a page with coverage, .html.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the findings.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of the choice of re-rendered samples.")
+@click.option("--allow-incomplete", is_flag=True, help="Accept missing shards: the dataset is still growing.")
+@click.option(
+    "--report",
+    "page",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a page with findings and coverage, .html.",
+)
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path), metavar="FILE", help="Write the findings as JSON."
+)
 @click.option(
     "--workers", type=click.IntRange(1), help="Processes; findings do not depend on it. [one per core, at most 8]"
 )
-@click.option("--quiet", is_flag=True, help="No progress bar.")
+@QUIET
 def verify(
     shards: str,
     samples: int,
     seed: int,
     allow_incomplete: bool,
-    report: Path | None,
+    page: Path | None,
     json_file: Path | None,
     workers: int | None,
     quiet: bool,
 ) -> None:
-    """Check that a dataset is complete and that its samples are what its data card says.
+    """Check that a dataset is complete and that its samples agree with its data card.
 
-    Every shard is read and held against its checksum; poses, cameras, windows, masks, contours, distance transforms
-    and patches are checked, and the meshes are drawn again at both poses. Exit code 0: every check passes; 1: one
-    fails; 2: wrong usage.
+    Every shard is read and compared with its checksum; poses, cameras, windows, masks, contours, distance transforms
+    and patches are checked, and the meshes are rendered again at both poses. Exit code 0: every check passes; 1: a
+    check fails; 2: wrong usage.
 
     \b
     synthgen verify shards
@@ -58,7 +64,7 @@ def verify(
     reader = ShardReader(shards)
     with progress_bar(quiet) as bar:
         task = bar.add_task("samples", total=sum(map(reader.n_samples, reader.committed)))
-        found = run(
+        report = run(
             shards,
             samples=samples,
             seed=seed,
@@ -66,33 +72,12 @@ def verify(
             workers=workers or min(8, cores()),
             on_shard=lambda n: bar.advance(task, n),
         )
-    for finding in found.findings:
-        click.echo(_line(finding))
-    click.echo(_covered(found))
+    click.echo(report.text)
     if json_file is not None:
-        write_atomic(json_file, found.as_json().encode())
-    if report is not None:
-        write_atomic(report, report_page(found).encode())
-        click.echo(f"{report}: the report", err=True)
-    failed = [finding.name for finding in found.findings if not finding.ok]
-    if failed:
-        click.echo(f"Error: {shards}: {len(failed)} checks fail: {', '.join(failed)}", err=True)
+        write_atomic(json_file, report.as_json().encode())
+    if page is not None:
+        write_atomic(page, report_page(report).encode())
+        click.echo(f"{page}: the report", err=True)
+    if report.failed:
+        click.echo(f"Error: {shards}: {len(report.failed)} checks fail: {', '.join(report.failed)}", err=True)
         sys.exit(1)
-
-
-def _line(finding: "Finding") -> str:
-    mark = "ok  " if finding.ok else "FAIL"
-    text = f"{mark} {finding.name:<28} {finding.covered - finding.failed:>7} of {finding.covered} {finding.of}"
-    if finding.ok:
-        worst = "" if finding.worst is None else f"worst {finding.worst:.3g}, "
-        return f"{text:<60} {worst}tolerance {finding.tolerance}" if finding.tolerance else text
-    where = f"not in {finding.of} {', '.join(map(str, finding.first))}" + (", ..." if finding.failed > 10 else "")
-    worst = "" if finding.worst is None else f"; worst {finding.worst:.3g} in {finding.worst_index}"
-    tolerance = f", tolerance {finding.tolerance}" if finding.tolerance else ""
-    note = f"; {finding.note}" if finding.note else ""
-    return f"{text}: {where}{worst}{tolerance}{note}"
-
-
-def _covered(report: "Report") -> str:
-    said = f"{report.committed} of {report.card['n']} samples are there and were read"
-    return f"{said}, {report.drawn} of them drawn again with {report.gl}" if report.drawn else said

@@ -30,7 +30,7 @@ from synthgen.config.surroundings import (
     SensorConfig,
     TabletopConfig,
 )
-from synthgen.engine import Device, EngineName
+from synthgen.names import Device, EngineName
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,14 +1,12 @@
 """Target objects of a dataset: mesh, hull, distance range, window, occluders and tables."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 from posecore.window import fixed_side_px
 from scipy.spatial import ConvexHull, QhullError
@@ -63,22 +61,6 @@ class TargetObject:
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         colours = self.mesh.colours[self.mesh.faces].mean(axis=1) / 255.0
         return np.asarray((colours * area[:, None]).sum(axis=0) / max(float(area.sum()), 1e-12))
-
-
-def object_ids(paths: Sequence[str]) -> list[int]:
-    """Object ids by file: the number of a BOP name (obj_000005.ply is 5), else 1, 2, ... in the order of the files.
-
-    Raises:
-        ConfigError: Two files have the same id.
-    """
-    numbers = [re.fullmatch(r"obj_(\d+)", Path(p).stem) for p in paths]
-    if all(numbers) and paths:
-        ids = [int(m.group(1)) for m in numbers if m]
-    else:
-        ids = list(range(1, len(paths) + 1))
-    if len(set(ids)) < len(ids):
-        raise ConfigError(f"--object: two files have the object id {max(ids, key=ids.count)}; rename one file")
-    return ids
 
 
 def make_targets(meshes: Mapping[int, Mesh], config: SynthConfig, assets: Assets | None = None) -> list[TargetObject]:

@@ -1,1 +1,1 @@
-"""From a plain scene to colour, depth and masks: Blender, or the rasteriser."""
+"""Rendering of plain scenes to colour, depth and masks: Blender, or the rasteriser."""

@@ -1,4 +1,4 @@
-"""Where Cycles traces: what this machine has, what is meant by 'auto', and which worker gets which GPU."""
+"""Devices of Cycles: the GPUs of this machine, the choice of 'auto', and the names of GPUs for workers."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 from posecore.errors import RenderError
 
-from synthgen.engine import GPU_DEVICES, Device
+from synthgen.names import GPU_DEVICES, Device
 
 _LISTING_TIMEOUT_S = 180  # the first start on a machine with GPUs may load their drivers
 
@@ -16,7 +16,7 @@ _LISTING_TIMEOUT_S = 180  # the first start on a machine with GPUs may load thei
 def list_gpus() -> dict[Device, int]:
     """Number of GPUs by kind that Cycles finds on this machine.
 
-    Another process looks, because one that imports Blender must not fork afterwards.
+    Blender is imported in a process of its own, because a process with Blender must not fork.
 
     Raises:
         RenderError: Blender does not start.
@@ -24,38 +24,38 @@ def list_gpus() -> dict[Device, int]:
     command = [sys.executable, "-m", "synthgen.engines.blender.devices"]
     try:
         run = subprocess.run(command, capture_output=True, text=True, timeout=_LISTING_TIMEOUT_S, check=True)
-        found: dict[Device, int] = json.loads(run.stdout.splitlines()[-1])
+        gpus: dict[Device, int] = json.loads(run.stdout.splitlines()[-1])
     except (OSError, subprocess.SubprocessError, ValueError, IndexError) as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        lines = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
         raise RenderError(
-            f"--device: Blender cannot be asked for its GPUs ({said[-1] if said else type(error).__name__}); "
+            f"--device: Blender cannot list its GPUs ({lines[-1] if lines else type(error).__name__}); "
             "use --device cpu or --engine raster"
         ) from error
-    return found
+    return gpus
 
 
 def choose_device(device: Device, gpus: Mapping[Device, int]) -> Device:
-    """The device that is meant.
+    """The device to use.
 
     Args:
-        device: Wish; 'auto' takes the first of OptiX, CUDA and the CPU that is there.
-        gpus: What is there.
+        device: Requested device; 'auto' takes the first available one of OptiX, CUDA and the CPU.
+        gpus: Number of GPUs by kind.
 
     Raises:
-        RenderError: The wished kind is not there.
+        RenderError: The requested kind is not available.
     """
     if device == "auto":
         return next((kind for kind in GPU_DEVICES if gpus.get(kind)), "cpu")
     if device != "cpu" and not gpus.get(device):
-        there = ", ".join(f"{count} {kind}" for kind, count in sorted(gpus.items())) or "none"
+        available = ", ".join(f"{count} {kind}" for kind, count in sorted(gpus.items())) or "none"
         raise RenderError(
-            f"device {device}: Cycles finds no such GPU here (it finds {there}); install NVIDIA's driver and look at "
+            f"device {device}: Cycles finds no such GPU here (it finds {available}); install NVIDIA's driver and check "
             "CUDA_VISIBLE_DEVICES, or use --device cpu"
         )
     return device
 
 
 def visible_gpus(count: int) -> tuple[str, ...]:
-    """What CUDA_VISIBLE_DEVICES calls each of the GPUs that this process sees."""
+    """Names of this process' GPUs for CUDA_VISIBLE_DEVICES."""
     named = [name.strip() for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
     return tuple(named[:count]) if named else tuple(str(i) for i in range(count))

@@ -1,17 +1,18 @@
-"""The one place that turns an engine's name into an engine."""
+"""Creation of engines by name."""
 
 from posecore.errors import ConfigError
 
-from synthgen.engine import ENGINE_NAMES, Device, Engine
+from synthgen.engine import Engine
+from synthgen.names import ENGINE_NAMES, Device
 
 
 def make_engine(name: str, *, threads: int = 0, device: Device = "cpu") -> Engine:
-    """Make an engine by name; only then is what it needs imported.
+    """Create an engine by name; its dependencies are imported only here.
 
     Args:
         name: 'cycles' (path tracing, the default elsewhere), 'eevee' (for GPUs) or 'raster' (drafts, no Blender).
-        threads: Threads a Blender engine may use, 0 for all cores.
-        device: Where Cycles traces; the other engines draw with OpenGL and take what it gives.
+        threads: Number of threads of a Blender engine, 0 for all cores.
+        device: Device of Cycles; the other engines draw with OpenGL's device.
 
     Raises:
         ConfigError: The name is unknown.

@@ -20,14 +20,12 @@ from synthgen.image.hdri import with_lamps
 from synthgen.image.sensor import linear_from_display
 from synthgen.scene import Light, Material, Scene, Vector
 
-Array = np.ndarray
-
 _SUPERSAMPLING = 2
-_WHITE_KEY = -1_000_000_000  # a mesh's all-white twin, drawn where a material replaces its colours
+_WHITE_KEY = -1_000_000_000  # key of a mesh's white copy, drawn where a material replaces its colours
 
 
 class RasterEngine:
-    """Engine over `posecore.raster`: no shadows, no reflections, lamps taken as if they were at infinity."""
+    """Engine over `posecore.raster`: no shadows, no reflections, lamps as if at infinity."""
 
     name = "raster"
 
@@ -36,7 +34,7 @@ class RasterEngine:
         self._rasteriser: Rasteriser | None = None
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make meshes known under their keys."""
+        """Load meshes under their keys."""
         if self._rasteriser is None:
             self._rasteriser = Rasteriser({})
         for key, mesh in meshes.items():
@@ -46,7 +44,7 @@ class RasterEngine:
             self._rasteriser.add(_WHITE_KEY + key, replace(mesh, vertex_rgb=white, uv=None, texture_rgb=None))
 
     def render(self, scene: Scene) -> RenderedScene:
-        """Render `scene.region_px`: colour with 2 x 2 samples a pixel, depth and index at the pixel centres."""
+        """Render `scene.region_px`: colour with 2 x 2 samples per pixel, depth and index at the pixel centres."""
         if self._rasteriser is None:
             raise RenderError("the raster engine has no meshes; call load first")
         x0, y0, width, height = scene.region_px
@@ -71,7 +69,7 @@ class RasterEngine:
         )
 
     def close(self) -> None:
-        """Free what was uploaded."""
+        """Release GPU memory."""
         if self._rasteriser is not None:
             self._rasteriser.close()
             self._rasteriser = None
@@ -91,15 +89,15 @@ def _shading(scene: Scene) -> Shading:
     return Shading(ambient=sum(ambient) / 3, diffuse=1.0, lights=lights)
 
 
-def _irradiance(light: Light, at_cam_m: Float[Array, "3"]) -> float:
-    """Irradiance in W/m^2 at a point that faces the lamp."""
+def _irradiance(light: Light, at_cam_m: Float[np.ndarray, "3"]) -> float:
+    """Irradiance of a surface that faces the lamp, W/m^2."""
     if light.kind == "sun":
         return light.strength
     d2 = float(np.sum((np.array(light.position_cam_m) - at_cam_m) ** 2))
     return light.strength / (d2 * math.pi * (4.0 if light.kind == "point" else 1.0))
 
 
-def _direction(light: Light, at_cam_m: Float[Array, "3"]) -> Vector:
+def _direction(light: Light, at_cam_m: Float[np.ndarray, "3"]) -> Vector:
     d = np.array(light.direction_cam) if light.kind == "sun" else np.array(light.position_cam_m) - at_cam_m
     x, y, z = d / max(float(np.linalg.norm(d)), 1e-12)
     return (float(x), float(y), float(z))
@@ -110,7 +108,7 @@ def _display_factor(rgb: Vector, scale: float) -> Vector:
     return (r, g, b)
 
 
-def _recolour(layers: SceneLayers, scene: Scene, K: Float[Array, "3 3"]) -> UInt8[Array, "h w 3"]:
+def _recolour(layers: SceneLayers, scene: Scene, K: Float[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "h w 3"]:
     """Apply each material's pattern, or its hue, saturation and value, to the pixels of its object."""
     rgb = layers.rgb
     assert rgb is not None
@@ -132,7 +130,7 @@ def _changes_colour(material: Material) -> bool:
     return (material.hue_shift, material.saturation, material.value) != (0.0, 1.0, 1.0)
 
 
-def _shift(rgb: UInt8[Array, "n 3"], material: Material) -> UInt8[Array, "n 3"]:
+def _shift(rgb: UInt8[np.ndarray, "n 3"], material: Material) -> UInt8[np.ndarray, "n 3"]:
     hsv = cv2.cvtColor(rgb[None].astype(np.float32) / np.float32(255.0), cv2.COLOR_RGB2HSV)
     hsv[..., 0] = (hsv[..., 0] + np.float32(360.0 * material.hue_shift)) % np.float32(360.0)
     hsv[..., 1] = np.clip(hsv[..., 1] * np.float32(material.saturation), 0.0, 1.0)
@@ -140,7 +138,9 @@ def _shift(rgb: UInt8[Array, "n 3"], material: Material) -> UInt8[Array, "n 3"]:
     return np.asarray((cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0] * 255.0 + 0.5).astype(np.uint8))
 
 
-def _resolve(rgb: Float[Array, "h2 w2 3"], hit: Array) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+def _resolve(
+    rgb: Float[np.ndarray, "h2 w2 3"], hit: np.ndarray
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """Average the fine samples of a pixel: straight colour and coverage. Samples that hit nothing are black."""
     size = (hit.shape[1] // _SUPERSAMPLING, hit.shape[0] // _SUPERSAMPLING)
     alpha = cv2.resize(hit.astype(np.float32), size, interpolation=cv2.INTER_AREA)

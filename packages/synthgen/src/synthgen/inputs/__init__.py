@@ -1,1 +1,1 @@
-"""What the command line names, loaded: meshes with their symmetries, photographs, panoramas, occluders."""
+"""Inputs of a dataset, loaded: meshes with their symmetries, photographs, panoramas, occluders."""

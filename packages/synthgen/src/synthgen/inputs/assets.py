@@ -1,4 +1,4 @@
-"""What a dataset is made with beside its objects: photographs, panoramas and occluder meshes."""
+"""Assets of a dataset beside its objects: photographs, panoramas and occluder meshes."""
 
 from dataclasses import dataclass
 
@@ -8,12 +8,12 @@ from posecore.mesh import Mesh
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Assets:
-    """Files and meshes that scenes draw from; the order decides what is drawn, so it is sorted by name.
+    """Files and meshes that scenes draw from, sorted by name, because their order affects the draws.
 
     Attributes:
         photos: Background photographs, readable on every worker.
         hdris: Panoramas, readable on every worker.
-        occluders: Occluder meshes in their own size; none leaves primitive shapes.
+        occluders: Occluder meshes in their original size; without any, primitive shapes.
     """
 
     photos: tuple[str, ...] = ()
@@ -21,7 +21,7 @@ class Assets:
     occluders: tuple[Mesh, ...] = ()
 
     def card(self) -> dict[str, dict[str, int | str] | None]:
-        """Counts and content hashes for the data card, nothing for a kind that is not there."""
+        """Counts and content hashes for the data card; None for absent kinds."""
         return {
             "backgrounds": {"photos": len(self.photos), "sha256": _hash(self.photos)} if self.photos else None,
             "hdris": {"files": len(self.hdris), "sha256": _hash(self.hdris)} if self.hdris else None,

@@ -1,4 +1,4 @@
-"""What a command line names, found and loaded: objects, photographs, panoramas, occluders, symmetries."""
+"""Files named on the command line, loaded: meshes, symmetries, photographs, panoramas, occluders."""
 
 import logging
 import re
@@ -9,14 +9,12 @@ from pathlib import Path
 from posecore.bop import ModelInfo
 from posecore.bop.jsonfile import read_json
 from posecore.bop.models_info import load_model_info
-from posecore.errors import ConfigError, MeshError, TextureError
+from posecore.errors import ConfigError, DatasetError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
 
-from synthgen.draw.target import object_ids
 from synthgen.image.background import list_photos
 from synthgen.image.hdri import list_hdris
 from synthgen.inputs.assets import Assets
-from synthgen.pairs.data_card import load_symmetries
 
 log = logging.getLogger(__name__)
 
@@ -26,17 +24,17 @@ MODELS_INFO = "models_info.json"
 
 @dataclass(frozen=True, kw_only=True)
 class Sources:
-    """Files and folders as they were given.
+    """Paths of a dataset's inputs.
 
     Attributes:
         objects: Meshes, folders of meshes (subfolders included), or BOP `models/` folders.
-        units: Unit of the meshes' coordinates; those of a BOP folder are in mm whatever this says.
+        units: Unit of the meshes' coordinates; meshes of a BOP folder are always in mm.
         backgrounds: Folder of photographs.
         hdris: Folder of panoramas.
         occluders: Folder of meshes, or one mesh.
-        models_info: BOP file to take symmetries from; without it those in or beside `objects`.
-        allow_missing_textures: Whether a mesh whose texture is missing has its plain colours instead.
-        skip_bad_objects: Whether an object that cannot be loaded is left out.
+        models_info: BOP file with symmetries; None reads the files in or beside `objects`.
+        allow_missing_textures: Whether a mesh whose texture is missing gets its plain colours.
+        skip_bad_objects: Whether objects that cannot be loaded are left out.
     """
 
     objects: tuple[Path, ...]
@@ -49,13 +47,13 @@ class Sources:
     skip_bad_objects: bool = False
 
     def meshes(self) -> dict[int, Mesh]:
-        """The objects by id; see `target.object_ids`. An object that is left out leaves the others' ids as they are.
+        """Objects by id; see `object_ids`. A skipped object does not change the ids of the others.
 
         Raises:
-            MeshError: One cannot be loaded, or none of them.
+            MeshError: An object cannot be loaded, or all are skipped.
             ConfigError: A folder holds no mesh, or two files have one id.
         """
-        files = [found for given in self.objects for found in find_meshes(given, self.units, "--object")]
+        files = [mesh_file for path in self.objects for mesh_file in find_meshes(path, self.units, "--object")]
         loaded, bad = {}, []
         for obj_id, (path, units) in zip(object_ids([str(path) for path, _ in files]), files, strict=True):
             try:
@@ -71,7 +69,7 @@ class Sources:
         return loaded
 
     def assets(self) -> Assets:
-        """Photographs, panoramas and occluder meshes, every one looked at.
+        """Photographs, panoramas and occluder meshes, each decoded once.
 
         Raises:
             ConfigError: A folder is missing, empty, or holds a file that does not decode.
@@ -91,64 +89,104 @@ class Sources:
             raise MeshError(f"{error}, or add --allow-missing-textures for plain colours") from error
 
     def infos(self, meshes: Mapping[int, Mesh]) -> dict[int, ModelInfo]:
-        """Symmetries of the objects.
+        """Symmetries of the objects by id.
 
         Raises:
-            DatasetError: The file is missing or broken, or knows none of the objects.
+            DatasetError: A models_info file is missing or broken, or lists none of the objects.
         """
         if self.models_info is not None:
-            return load_symmetries(str(self.models_info), meshes)
-        known: dict[int, ModelInfo] = {}
-        for given in self.objects:
-            inside = {i: m for i, m in meshes.items() if given in (Path(m.path), Path(m.path).parent)}
-            if given.is_dir() and inside and (given / MODELS_INFO).is_file():
-                known |= load_symmetries(str(given / MODELS_INFO), inside)
-            elif not given.is_dir():
-                known |= {i: info for i in inside if (info := info_beside(given)) is not None}
-        return known
+            return load_symmetries(self.models_info, meshes)
+        infos: dict[int, ModelInfo] = {}
+        for path in self.objects:
+            inside = {i: m for i, m in meshes.items() if path in (Path(m.path), Path(m.path).parent)}
+            if path.is_dir() and inside and (path / MODELS_INFO).is_file():
+                infos |= load_symmetries(path / MODELS_INFO, inside)
+            elif not path.is_dir():
+                infos |= {i: info for i in inside if (info := info_beside(path)) is not None}
+        return infos
+
+
+def object_ids(paths: Sequence[str]) -> list[int]:
+    """Object ids by file: the number of a BOP name (obj_000005.ply is 5), else 1, 2, ... in the order of the files.
+
+    Raises:
+        ConfigError: Two files would get one id.
+    """
+    numbers = [_bop_number(Path(path)) for path in paths]
+    ids = [number for number in numbers if number is not None]
+    if not paths or len(ids) < len(paths):
+        ids = list(range(1, len(paths) + 1))
+    if len(set(ids)) < len(ids):
+        raise ConfigError(f"--object: two files have the object id {max(ids, key=ids.count)}; rename one file")
+    return ids
+
+
+def load_symmetries(file: Path, meshes: Mapping[int, Mesh]) -> dict[int, ModelInfo]:
+    """Symmetries of the objects from a `models_info.json` whose keys are object ids or the meshes' file names.
+
+    Raises:
+        DatasetError: The file is missing or broken, or lists none of the objects.
+    """
+    names = {obj_id: (str(obj_id), Path(mesh.path).stem) for obj_id, mesh in meshes.items()}
+    infos, listed = _listed_infos(file, names)
+    if not infos:
+        keys = sorted({name for pair in names.values() for name in pair})
+        raise DatasetError(f"{file}: no entry for {', '.join(keys)}; its keys are {', '.join(listed)}")
+    return infos
 
 
 def info_beside(mesh_file: Path) -> ModelInfo | None:
-    """What the `models_info.json` beside a mesh says of it, by its name, or by the number in a BOP name.
+    """Entry of a mesh in the `models_info.json` beside it, by file name or BOP number; None without an entry.
 
     Raises:
-        DatasetError: It is broken.
+        DatasetError: The file is broken.
     """
-    file = mesh_file.with_name(MODELS_INFO)
+    file, number = mesh_file.with_name(MODELS_INFO), _bop_number(mesh_file)
     if not file.is_file():
         return None
-    numbered = re.fullmatch(r"obj_(\d+)", mesh_file.stem)
-    names = (mesh_file.stem, str(int(numbered[1])) if numbered else "")
-    listed = read_json(file)
-    return next((load_model_info(listed[name], f"{file}, object {name}") for name in names if name in listed), None)
+    names = (mesh_file.stem, *(() if number is None else (str(number),)))
+    return _listed_infos(file, {0: names})[0].get(0)
 
 
-def find_meshes(given: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:
-    """Mesh files that a path stands for, sorted by name, with their units.
+def _listed_infos(file: Path, names: Mapping[int, Sequence[str]]) -> tuple[dict[int, ModelInfo], list[str]]:
+    """Entries of a `models_info.json` by id, each under the first of its names, and the file's keys."""
+    content = read_json(file)
+    keys = {obj_id: next((name for name in each if name in content), None) for obj_id, each in names.items()}
+    infos = {i: load_model_info(content[key], f"{file}, object {key}") for i, key in keys.items() if key is not None}
+    return infos, list(content)
+
+
+def _bop_number(path: Path) -> int | None:
+    match = re.fullmatch(r"obj_(\d+)", path.stem)
+    return int(match[1]) if match else None
+
+
+def find_meshes(path: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:
+    """Mesh files of a path, sorted by name, with their units.
 
     A folder with `models_info.json` and obj_XXXXXX.ply files is a BOP models folder: those files, in mm. Any other
     folder stands for all meshes in it and below; a `models_info.json` in it has their names as keys.
 
     Args:
-        given: File or folder.
-        units: Of meshes outside BOP folders.
-        option: Named in messages.
+        path: File or folder.
+        units: Unit of meshes outside BOP folders.
+        option: Command-line option, for messages.
 
     Raises:
         ConfigError: A folder without meshes, or with the numbers of BOP objects and without their files.
     """
-    if not given.is_dir():
-        return [(given, units)]
-    if (given / MODELS_INFO).is_file():
-        models = [p for p in sorted(given.glob("*.ply")) if re.fullmatch(r"obj_\d+", p.stem)]
+    if not path.is_dir():
+        return [(path, units)]
+    if (path / MODELS_INFO).is_file():
+        models = [file for file in sorted(path.glob("*.ply")) if _bop_number(file) is not None]
         if models:
-            return [(path, "mm") for path in models]
-        if any(key.isdigit() for key in read_json(given / MODELS_INFO)):
+            return [(file, "mm") for file in models]
+        if any(key.isdigit() for key in read_json(path / MODELS_INFO)):
             raise ConfigError(
-                f"{option} {given}: {MODELS_INFO} has object numbers and there is no obj_XXXXXX.ply; name the meshes "
+                f"{option} {path}: {MODELS_INFO} has object numbers and there is no obj_XXXXXX.ply; name the meshes "
                 "like that, or let its keys be their names"
             )
-    found = sorted(p for p in given.rglob("*") if p.suffix.lower() in MESH_SUFFIXES)
-    if not found:
-        raise ConfigError(f"{option} {given}: no mesh in this folder, expected {', '.join(MESH_SUFFIXES)} files")
-    return [(path, units) for path in found]
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in MESH_SUFFIXES)
+    if not files:
+        raise ConfigError(f"{option} {path}: no mesh in this folder, expected {', '.join(MESH_SUFFIXES)} files")
+    return [(file, units) for file in files]

@@ -1,1 +1,1 @@
-"""Looking at what is there: a dataset's card, its samples, this machine."""
+"""Summaries and pictures of datasets, reproduced samples, and checks of this machine."""

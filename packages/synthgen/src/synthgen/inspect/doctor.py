@@ -1,4 +1,4 @@
-"""What this machine has of what rendering needs, and what to do about the rest."""
+"""Requirements of rendering, checked on this machine, with remedies and measured speed."""
 
 import json
 import platform
@@ -6,25 +6,26 @@ import re
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 from posecore.errors import RenderError
+from posecore.mesh import Units, load_mesh
 
 from synthgen.config import SynthConfig
-from synthgen.engine import ENGINE_NAMES
 from synthgen.engines.devices import list_gpus
-from synthgen.inspect.speed import Speed
+from synthgen.inspect.speed import EngineSpeed, measure_engine
 from synthgen.machine import free_bytes, machine
+from synthgen.names import ENGINE_NAMES, EngineName
 from synthgen.pairs.data_card import versions
 
 State = Literal["ok", "warning", "missing"]
 
 _PROBE_TIMEOUT_S = 120
 _GB = 1e9
-_SMALL_SHM_BYTES = 64 * 2**20  # what Docker gives unless told otherwise
+_SMALL_SHM_BYTES = 64 * 2**20  # Docker's default
 _PACKAGES = {  # shared libraries that Blender and EGL load, and the Debian packages that hold them
     "libEGL": "libegl1",
     "libGL": "libgl1",
@@ -46,8 +47,8 @@ _GL = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
-    """One thing that was looked at: its state, what was found, and what to do where that is needed."""
+class MachineCheck:
+    """One checked requirement: its state, the finding, and the remedy where one is needed."""
 
     name: str
     state: State
@@ -56,102 +57,171 @@ class Found:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Engines:
-    """Engines that can run here, the path tracer first, and whether GL is drawn by the processor."""
+class UsableEngines:
+    """Engines that can run here, the path tracer first, and whether the processor draws GL."""
 
-    names: tuple[str, ...]
+    names: tuple[EngineName, ...]
     software_gl: bool
 
-    def worth_measuring(self) -> tuple[str, ...]:
-        """Those to measure when none is asked for: EEVEE on software GL is for nothing but tests."""
+    def worth_measuring(self) -> tuple[EngineName, ...]:
+        """Engines to measure by default: EEVEE on software GL serves tests alone."""
         return tuple(name for name in self.names if name != "eevee" or not self.software_gl)
 
 
-def look(out: Path, wanted: Sequence[str]) -> tuple[list[Found], Engines]:
-    """Look at this machine; nothing is rendered.
+@dataclass(frozen=True, kw_only=True)
+class DoctorJob:
+    """A planned dataset.
+
+    Attributes:
+        config: Recipe.
+        n: Number of pairs.
+        engines: Engines that must work; empty: any one will do.
+        seconds: Measuring time, divided between the engines; 0 measures nothing.
+        mesh: Object to measure with; None for a simple one.
+        units: Unit of the mesh.
+        out: Folder of the dataset.
+    """
+
+    config: SynthConfig
+    n: int
+    engines: tuple[EngineName, ...] = ()
+    seconds: float = 30.0
+    mesh: Path | None = None
+    units: Units = "mm"
+    out: Path = Path()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoctorReport:
+    """Checks of this machine and the speed of its engines.
+
+    Attributes:
+        checks: Checked requirements.
+        speeds: Measured engines.
+        n: Number of planned pairs.
+    """
+
+    checks: tuple[MachineCheck, ...]
+    speeds: tuple[EngineSpeed, ...]
+    n: int
+
+    @property
+    def missing(self) -> list[str]:
+        """Names of missing requirements and of engines that could not be measured."""
+        return [check.name for check in self.checks if check.state == "missing"] + [
+            speed.engine for speed in self.speeds if speed.measured is None
+        ]
+
+    def as_text(self) -> str:
+        """The report as a table."""
+        lines = []
+        for check in self.checks:
+            lines.append(f"{check.state:<8} {check.name:<11} {check.text}")
+            if check.remedy:
+                lines.append(f"{'':<20} -> {check.remedy}")
+        for speed in self.speeds:
+            state = "ok" if speed.measured else "missing"
+            lines.append(f"{state:<8} {speed.engine:<11} {speed.text(self.n)}")
+        return "\n".join(lines)
+
+    def as_json(self) -> str:
+        """The report as one JSON object."""
+        speeds = [speed.as_dict(self.n) for speed in self.speeds]
+        return json.dumps({"checks": [asdict(check) for check in self.checks], "speed": speeds}, indent=1)
+
+
+def diagnose(job: DoctorJob, on_engine: Callable[[str, float], None] = lambda engine, seconds: None) -> DoctorReport:
+    """Check this machine, and measure how fast its engines render.
 
     Args:
-        out: Where a dataset would go.
-        wanted: Engines that must work; none: what is missing for one that another can stand for is a warning.
+        job: Dataset to plan for.
+        on_engine: Called before each measurement with the engine and its measuring time, seconds.
+
+    Raises:
+        MeshError: The mesh cannot be loaded.
+    """
+    if job.mesh is not None:
+        load_mesh(job.mesh, units=job.units)
+    checks, usable = check_machine(job.out, job.engines)
+    chosen = [name for name in job.engines or usable.worth_measuring() if name in usable.names] if job.seconds else []
+    speeds = []
+    for engine in chosen:
+        seconds = job.seconds / len(chosen)
+        on_engine(engine, seconds)
+        speeds.append(measure_engine(engine, job.config, seconds, job.mesh, job.units))
+    return DoctorReport(checks=(*checks, *check_space(speeds, job.n, job.out)), speeds=tuple(speeds), n=job.n)
+
+
+def check_machine(out: Path, required: Sequence[str]) -> tuple[list[MachineCheck], UsableEngines]:
+    """Check this machine; nothing is rendered.
+
+    Args:
+        out: Folder of the dataset.
+        required: Engines that must work; empty: a missing part that another engine does without is only a warning.
 
     Returns:
-        What was found, and the engines that can run.
+        The checks, and the engines that can run.
     """
     gl, software = _gl()
-    blender = _blender(needed=bool({"cycles", "eevee"} & set(wanted)))
+    blender = _blender(needed=bool({"cycles", "eevee"} & set(required)))
     names = (
         [name for name in ENGINE_NAMES if name == "raster" or blender.state == "ok"] if gl.state != "missing" else []
     )
-    found = [
-        Found(name="python", state="ok", text=f"{platform.python_version()}, {platform.platform()}"),
-        Found(name="versions", state="ok", text=", ".join(f"{k} {v}" for k, v in versions(SynthConfig()).items())),
+    checks = [
+        MachineCheck(name="python", state="ok", text=f"{platform.python_version()}, {platform.platform()}"),
+        MachineCheck(
+            name="versions", state="ok", text=", ".join(f"{k} {v}" for k, v in versions(SynthConfig()).items())
+        ),
         blender,
         gl,
         _gpus(blender),
         *_resources(out),
     ]
-    return found, Engines(names=tuple(names), software_gl=software)
+    return checks, UsableEngines(names=tuple(names), software_gl=software)
 
 
-def disk_found(speeds: Sequence[Speed], n: int, out: Path) -> list[Found]:
-    """Whether what was measured fits on the disk at `out`."""
+def check_space(speeds: Sequence[EngineSpeed], n: int, out: Path) -> list[MachineCheck]:
+    """A missing requirement for each measured engine whose n pairs exceed the free space at `out`."""
     free = free_bytes(out)
+    needed = {s.engine: n * s.measured.bytes_per_pair for s in speeds if s.measured is not None}
     return [
-        Found(
+        MachineCheck(
             name="disk space",
             state="missing",
-            text=f"{n} pairs of {s.engine} take {n * s.bytes_per_pair / _GB:.3g} GB, "
-            f"free at {out} are {free / _GB:.3g} GB",
+            text=f"{n} pairs of {engine} take {size / _GB:.3g} GB, free at {out} are {free / _GB:.3g} GB",
             remedy="free some space, give another --out, or render fewer pairs",
         )
-        for s in speeds
-        if s.pairs and n * s.bytes_per_pair > free
+        for engine, size in needed.items()
+        if size > free
     ]
 
 
-def as_text(found: Sequence[Found], speeds: Sequence[Speed], n: int) -> str:
-    """Everything as a table."""
-    lines = []
-    for item in found:
-        lines.append(f"{item.state:<8} {item.name:<11} {item.text}")
-        if item.remedy:
-            lines.append(f"{'':<20} -> {item.remedy}")
-    for speed in speeds:
-        state = "ok" if speed.pairs else "missing"
-        lines.append(f"{state:<8} {speed.engine:<11} {speed.text(n)}")
-    return "\n".join(lines)
-
-
-def as_json(found: Sequence[Found], speeds: Sequence[Speed], n: int) -> str:
-    """Everything as one JSON object."""
-    measured = [asdict(s) | {"pairs_per_s": s.pairs_per_s, "n": n, "hours": s.hours(n)} for s in speeds]
-    return json.dumps({"found": [asdict(item) for item in found], "speed": measured}, indent=1)
-
-
-def _blender(needed: bool) -> Found:
+def _blender(needed: bool) -> MachineCheck:
     state: State = "missing" if needed else "warning"
-    ok, said = _asked(_BPY)
+    ok, output = _run_python(_BPY)
     if ok:
-        return Found(name="bpy", state="ok", text=said)
-    return Found(
+        return MachineCheck(name="bpy", state="ok", text=output)
+    return MachineCheck(
         name="bpy",
         state=state,
-        text=said,
-        remedy=_library_remedy(said)
+        text=output,
+        remedy=_library_remedy(output)
         or "pip install 'bpy>=4.5,<4.6' (needs Python 3.11); --engine raster works without it",
     )
 
 
-def _gl() -> tuple[Found, bool]:
-    ok, said = _asked(_GL)
+def _gl() -> tuple[MachineCheck, bool]:
+    ok, output = _run_python(_GL)
     if not ok:
-        remedy = _library_remedy(said) or "install a GPU driver with EGL, or Mesa (Debian: libegl1 libgl1-mesa-dri)"
-        return Found(name="GL", state="missing", text=said, remedy=remedy), False
-    device, software = json.loads(said)
+        remedy = _library_remedy(output) or "install a GPU driver with EGL, or Mesa (Debian: libegl1 libgl1-mesa-dri)"
+        return MachineCheck(name="GL", state="missing", text=output, remedy=remedy), False
+    device, software = json.loads(output)
     if not software:
-        return Found(name="GL", state="ok", text=f"{device}; labels of another driver may differ along edges"), False
+        return MachineCheck(
+            name="GL", state="ok", text=f"{device}; labels of another driver may differ along edges"
+        ), False
     return (
-        Found(
+        MachineCheck(
             name="GL",
             state="warning",
             text=f"{device}, drawn by the processor: hypotheses, labels and the engines raster and eevee are slower",
@@ -161,28 +231,28 @@ def _gl() -> tuple[Found, bool]:
     )
 
 
-def _gpus(blender: Found) -> Found:
+def _gpus(blender: MachineCheck) -> MachineCheck:
     if blender.state != "ok":
-        return Found(name="GPUs", state="warning", text="unknown: Blender does not start")
+        return MachineCheck(name="GPUs", state="warning", text="unknown: Blender does not start")
     try:
         gpus = list_gpus()
     except RenderError as error:
-        return Found(name="GPUs", state="warning", text=str(error))
+        return MachineCheck(name="GPUs", state="warning", text=str(error))
     if not gpus:
-        return Found(name="GPUs", state="ok", text="none that Cycles can use: it traces on the processor")
+        return MachineCheck(name="GPUs", state="ok", text="none that Cycles can use: it traces on the processor")
     listed = ", ".join(f"{count} {kind}" for kind, count in gpus.items())
-    return Found(name="GPUs", state="ok", text=f"{listed}; use --device auto")
+    return MachineCheck(name="GPUs", state="ok", text=f"{listed}; use --device auto")
 
 
-def _resources(out: Path) -> list[Found]:
+def _resources(out: Path) -> list[MachineCheck]:
     here = machine()
     shared = f"{here.shared_bytes / _GB:.3g} GB"
     small = here.shared_bytes <= _SMALL_SHM_BYTES
     return [
-        Found(name="cores", state="ok", text=f"{here.cores:g} of {here.cpu}"),
-        Found(name="memory", state="ok", text=f"{here.memory_bytes / _GB:.3g} GB"),
-        Found(name="disk", state="ok", text=f"{free_bytes(out) / _GB:.4g} GB free at {out}"),
-        Found(
+        MachineCheck(name="cores", state="ok", text=f"{here.cores:g} of {here.cpu}"),
+        MachineCheck(name="memory", state="ok", text=f"{here.memory_bytes / _GB:.3g} GB"),
+        MachineCheck(name="disk", state="ok", text=f"{free_bytes(out) / _GB:.4g} GB free at {out}"),
+        MachineCheck(
             name="/dev/shm",
             state="warning" if small else "ok",
             text=shared,
@@ -191,8 +261,8 @@ def _resources(out: Path) -> list[Found]:
     ]
 
 
-def _asked(code: str) -> tuple[bool, str]:
-    """Run Python code in another process: a crash or a missing library is found, not suffered."""
+def _run_python(code: str) -> tuple[bool, str]:
+    """Whether Python code succeeds in a process of its own, which may crash, and its last line or its error."""
     try:
         run = subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, timeout=_PROBE_TIMEOUT_S, check=False
@@ -203,12 +273,12 @@ def _asked(code: str) -> tuple[bool, str]:
         return True, run.stdout.splitlines()[-1]
     if run.returncode < 0:
         return False, f"crashes ({signal.Signals(-run.returncode).name})"
-    return False, (run.stderr.strip().splitlines() or ["fails without a word"])[-1]
+    return False, (run.stderr.strip().splitlines() or ["fails without a message"])[-1]
 
 
-def _library_remedy(said: str) -> str:
-    """What to install when the loader misses a shared library."""
-    missing = re.search(r"(lib[\w+-]+)(\.so[.\d]*): cannot open shared object file", said)
+def _library_remedy(message: str) -> str:
+    """Package to install when the loader misses a shared library."""
+    missing = re.search(r"(lib[\w+-]+)(\.so[.\d]*): cannot open shared object file", message)
     if missing is None:
         return ""
     name, package = missing.group(1) + missing.group(2), _PACKAGES.get(missing.group(1))

@@ -1,4 +1,4 @@
-"""What a dataset says of itself, for a human and for machines."""
+"""Summary of a dataset from its data card and manifest, as text and as JSON."""
 
 import json
 from collections.abc import Mapping
@@ -10,15 +10,15 @@ from posecore.errors import DatasetError
 from posecore.shard import ShardReader, n_shards
 
 from synthgen.bop.dataset_writer import CARD as BOP_CARD
-from synthgen.config import CutConfig, load_config
-from synthgen.verify.facts import manifest_lines
+from synthgen.config import CutConfig, load_config, migrate
+from synthgen.pairs.data_card import migrated_card
 
-_ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # and what is counted of each
+_ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # and the counted items
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy")
 
 
 def dataset_info(url: str) -> dict[str, Any]:
-    """The data card of a shard dataset, or of a BOP dataset of `synthgen bop`, with what is there.
+    """Data card of a shard dataset, or of a BOP dataset of `synthgen bop`, with the extent of the committed data.
 
     Raises:
         ShardError: Not a dataset, or a broken one.
@@ -27,13 +27,13 @@ def dataset_info(url: str) -> dict[str, Any]:
     if "://" not in url and (Path(url) / BOP_CARD).is_file():
         return _bop_info(Path(url))
     reader = ShardReader(url)
-    card, lines = reader.card, manifest_lines(reader)
+    card, lines = migrated_card(reader.card), reader.manifest_lines
     pairs = sum(map(reader.n_samples, reader.committed))
     sizes: dict[str, int] = {}
     for line in lines.values():
         for field, size in line["bytes"].items():
             sizes[field] = sizes.get(field, 0) + int(size)
-    known = (
+    card_keys = (
         "n", "shard_size", "patch_px", "contour_points", "depth_step_m", "seed", "merged", "source", "objects",
         "camera", "units",
     )  # fmt: skip
@@ -52,21 +52,21 @@ def dataset_info(url: str) -> dict[str, Any]:
         "changed_keys": changed_keys(card["cut"], CutConfig())
         if "cut" in card
         else changed_keys(card.get("config", {})),
-        "card": {key: card[key] for key in known if key in card},
+        "card": {key: card[key] for key in card_keys if key in card},
         "assets": {name: card.get(name) for name in _ASSETS},
         "versions": card.get("versions", {}),
     }
 
 
 def changed_keys(config: Mapping[str, Any], default: CutConfig | None = None) -> dict[str, tuple[Any, Any]]:
-    """Keys of a resolved configuration that differ from a default, that of `render`: (value there, default)."""
+    """Keys of a resolved configuration with another value than a default (`render`'s if None): (value, default)."""
     usual = _flat(json.loads(json.dumps(config_tools.to_dict(default or load_config("default")))))
-    found = _flat(json.loads(json.dumps(dict(config))))
-    return {key: (value, usual.get(key)) for key, value in found.items() if value != usual.get(key)}
+    values = _flat(json.loads(json.dumps(dict(config))))
+    return {key: (value, usual.get(key)) for key, value in values.items() if value != usual.get(key)}
 
 
 def info_text(info: Mapping[str, Any]) -> str:
-    """The card as lines to read."""
+    """The summary in lines to read."""
     lines = [f"{info['dataset']}: {info['kind']}"]
     if info["kind"] == "training pairs":
         lines += _pair_lines(info)
@@ -98,8 +98,8 @@ def info_text(info: Mapping[str, Any]) -> str:
 
 def _source_lines(source: Mapping[str, Any]) -> list[str]:
     hypotheses = {"drawn": "drawn", "given": "of a result file"}[source["hypotheses"]]
-    of = f"{source['dataset']}, split {source['split']}, sha256 {source['sha256'][:16]}"
-    lines = [_entry("images", f"{source['images']} of {of}"), _entry("hypotheses", hypotheses)]
+    dataset = f"{source['dataset']}, split {source['split']}, sha256 {source['sha256'][:16]}"
+    lines = [_entry("images", f"{source['images']} of {dataset}"), _entry("hypotheses", hypotheses)]
     return lines + [_entry("left out", f"{count} {why}") for why, count in sorted(source["left_out"].items())]
 
 
@@ -137,7 +137,7 @@ def _bop_info(folder: Path) -> dict[str, Any]:
             "split": card["split"],
             "frames": card["frames"],
             "sequences": card["sequences"],
-            "changed_keys": changed_keys(config),
+            "changed_keys": changed_keys(migrate(config)),
             "card": {"objects": card["objects"], "camera": config["camera"], "seed": config["seed"]},
             "assets": {name: card.get(name) for name in _ASSETS},
             "versions": card["versions"],

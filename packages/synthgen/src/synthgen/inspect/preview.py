@@ -1,6 +1,7 @@
-"""Contact sheets: what the samples of a dataset look like, with their labels drawn over them."""
+"""Contact sheets: samples of a dataset with their labels overlaid."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -8,18 +9,18 @@ from jaxtyping import Float, UInt8
 from posecore import se3
 from posecore.camera import project
 from posecore.contour import contour_mask
-from posecore.errors import ShardError
+from posecore.errors import ConfigError, ShardError
+from posecore.files import write_atomic
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
 
-Array = np.ndarray
-Image = UInt8[Array, "h w 3"]
+Image = UInt8[np.ndarray, "h w 3"]
 
 CELL_PX = 256
 _CAPTION_PX = 22
 _TITLES = (
-    "scene, truth green, hypothesis red",
+    "scene, ground truth green, hypothesis red",
     "hypothesis and its contour",
-    "distance to true contour",
+    "distance to ground-truth contour",
     "distance to hypothesis contour",
     "visible, hidden, other",
     "scene depth",
@@ -43,19 +44,39 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
     for shard_id in reader.committed:
         start = shard_id * reader.shard_size
         stop = start + reader.n_samples(shard_id)
-        wanted = range(max(first, start), min(stop, first + count))
-        if not wanted:
+        indices = range(max(first, start), min(stop, first + count))
+        if not indices:
             continue
         samples = reader.read(shard_id)
-        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in wanted]
+        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in indices]
     if not rows:
         rendered = sum(map(reader.n_samples, reader.committed))
         raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
     return np.concatenate([title_row(), *rows])
 
 
-def sample_row(sample: Mapping[str, Array], index: int) -> Image:
-    """One row of a contact sheet from the fields of one sample."""
+def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> tuple[int, int]:
+    """Write a contact sheet as a picture; see `contact_sheet`.
+
+    Returns:
+        Width and height, pixels.
+
+    Raises:
+        ConfigError: The file's name does not end in .png or .jpg.
+        ShardError: Nothing to show.
+        StorageError: The file cannot be written.
+    """
+    if file.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise ConfigError(f"--out {file}: expected a .png or .jpg file")
+    sheet = contact_sheet(url, count, first=first)
+    ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
+    assert ok
+    write_atomic(file, data.tobytes())
+    return sheet.shape[1], sheet.shape[0]
+
+
+def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
+    """Row of a contact sheet from the fields of a sample."""
     K = sample["K_crop"]
     scale = CELL_PX / sample["scene_rgb"].shape[0]
     uv_scene = project(K, sample["scene_contour_cam_m"].astype(np.float64)) * scale
@@ -69,41 +90,41 @@ def sample_row(sample: Mapping[str, Array], index: int) -> Image:
         _enlarge(_mask_colours(sample["scene_mask"])),
         _enlarge(_depth_colours(sample["scene_depth_m"])),
     ]
-    turn = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
-    angle = np.rad2deg(se3.rotation_angle_rad(turn))
-    moved = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
+    R = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
+    angle = np.rad2deg(se3.rotation_angle_rad(R))
+    shift_mm = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
     caption = (
         f"sample {index}  scene {sample['scene_index']}  object {sample['obj_id']}  hypothesis off by {angle:.1f} deg, "
-        f"{moved:.1f} mm  visible {sample['visible_fraction']:.2f}  rejected {sample['rejected']}"
+        f"{shift_mm:.1f} mm  visible {sample['visible_fraction']:.2f}  rejected {sample['rejected']}"
     )
     return np.concatenate([np.concatenate(cells, axis=1), _strip([caption], len(cells))])
 
 
-def _enlarge(image: Image) -> UInt8[Array, "cell cell 3"]:
+def _enlarge(image: Image) -> UInt8[np.ndarray, "cell cell 3"]:
     return np.asarray(cv2.resize(image, (CELL_PX, CELL_PX), interpolation=cv2.INTER_NEAREST))
 
 
-def _dots(image: Image, uv_px: Float[Array, "n 2"], colour: tuple[int, int, int]) -> Image:
-    """Dots at continuous image coordinates; OpenCV counts pixel centres as whole numbers, in 1/16 px here."""
+def _dots(image: Image, uv_px: Float[np.ndarray, "n 2"], colour: tuple[int, int, int]) -> Image:
+    """Dots at continuous image coordinates; OpenCV has pixel centres at integers, in units of 1/16 px here."""
     image = np.ascontiguousarray(image)
     for u, v in np.rint((uv_px - 0.5) * 16).astype(int):
         cv2.circle(image, (int(u), int(v)), 16, colour, -1, cv2.LINE_AA, shift=4)
     return image
 
 
-def _colour_mapped(values: Float[Array, "h w"], low: float, high: float) -> Image:
+def _colour_mapped(values: Float[np.ndarray, "h w"], low: float, high: float) -> Image:
     grey = (np.clip((values - low) / max(high - low, 1e-9), 0, 1) * 255).astype(np.uint8)
     return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_TURBO)[..., ::-1])
 
 
-def _depth_colours(depth_m: Float[Array, "h w"]) -> Image:
+def _depth_colours(depth_m: Float[np.ndarray, "h w"]) -> Image:
     hit = depth_m > 0
     low, high = (float(depth_m[hit].min()), float(depth_m[hit].max())) if hit.any() else (0.0, 1.0)
     return np.where(hit[..., None], _colour_mapped(-depth_m, -high, -low), 0).astype(np.uint8)
 
 
-def _mask_colours(mask: UInt8[Array, "h w"]) -> Image:
-    """Visible part white, hidden part red, other things blue, the silhouette's contour green."""
+def _mask_colours(mask: UInt8[np.ndarray, "h w"]) -> Image:
+    """Visible part white, hidden part red, other objects blue, the silhouette's contour green."""
     image = np.zeros((*mask.shape, 3), np.uint8)
     image[mask & BIT_FOREGROUND > 0] = (60, 90, 160)
     image[mask & BIT_OBJECT > 0] = (190, 60, 60)
@@ -113,7 +134,7 @@ def _mask_colours(mask: UInt8[Array, "h w"]) -> Image:
 
 
 def title_row() -> Image:
-    """The headings above the rows of a contact sheet."""
+    """Headings above the rows of a contact sheet."""
     return _strip(_TITLES, len(_TITLES))
 
 
@@ -121,6 +142,6 @@ def _strip(texts: Sequence[str], cells: int) -> Image:
     strip = np.full((_CAPTION_PX, cells * CELL_PX, 3), 24, np.uint8)
     for i, text in enumerate(texts):
         size = 0.3 if len(texts) > 1 else 0.42
-        place = (i * CELL_PX + 4, _CAPTION_PX - 7)
-        cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, (230, 230, 230), 1, cv2.LINE_AA)
+        origin = (i * CELL_PX + 4, _CAPTION_PX - 7)
+        cv2.putText(strip, text, origin, cv2.FONT_HERSHEY_SIMPLEX, size, (230, 230, 230), 1, cv2.LINE_AA)
     return strip

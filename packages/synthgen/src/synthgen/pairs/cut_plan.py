@@ -5,17 +5,14 @@ errors of a detector or on its previous results.
 """
 
 import hashlib
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float
-from posecore import config as config_tools
 from posecore import se3
 from posecore.bop import BopDataset, GroundTruth, read_results
 from posecore.camera import Camera, project
@@ -28,11 +25,8 @@ from synthgen.draw.poses import draw_hypothesis, fraction_inside
 from synthgen.draw.random_streams import Purpose, Subject, stream
 from synthgen.draw.target import hull
 from synthgen.image.region import contains
-from synthgen.pairs.data_card import DEPTH_STEPS, FINEST_DEPTH_STEP_M, UNITS, package_versions
 
 Pose = Float[np.ndarray, "4 4"]
-_CAMERA_PX = 1e-6
-"""Largest difference between the entries of equal camera matrices."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -324,65 +318,3 @@ def _hypotheses_by_image(dataset: BopDataset, file: str | Path) -> dict[tuple[in
 def rigid(T: Pose) -> Pose:
     """The pose with the nearest rotation, because files have few digits."""
     return se3.make_T(se3.nearest_rotation(T[:3, :3]), T[:3, 3])
-
-
-def make_card(dataset: BopDataset, planned: Plan, config: CutConfig, *, drawn: bool = True) -> dict[str, Any]:
-    """The data card, independent of time and machine.
-
-    Args:
-        dataset: Images.
-        planned: Pairs to cut.
-        config: Configuration.
-        drawn: Whether hypotheses are drawn, or read from a file.
-    """
-    camera = planned.images[0].camera
-    deepest_m = max(
-        float(dataset.mesh(obj_id).center_cam_m(T)[2]) + dataset.mesh(obj_id).diameter_m
-        for image in planned.images
-        for obj_id, T in (
-            *((gt.obj_id, gt.T_cam_obj) for gt in image.annotated),
-            *((pair.gt.obj_id, pair.T_cam_obj_hypothesis) for pair in image.pairs),
-        )
-    )
-    shared = all(np.abs(image.camera.K - camera.K).max() < _CAMERA_PX for image in planned.images)
-    return {
-        "n": planned.n,
-        "shard_size": config.shard_size,
-        "patch_px": config.patch_px,
-        "contour_points": config.contour_points,
-        "depth_step_m": FINEST_DEPTH_STEP_M
-        * 2 ** max(0, math.ceil(math.log2(deepest_m / (DEPTH_STEPS * FINEST_DEPTH_STEP_M)))),
-        "seed": config.seed,
-        "source": {
-            "dataset": dataset.name,
-            "split": dataset.split,
-            "images": len(planned.images),
-            "hypotheses": "drawn" if drawn else "given",
-            "sha256": planned.digest,
-            "left_out": dict(planned.left_out),
-        },
-        "cut": config_tools.to_dict(config),
-        "windows": config.window,
-        "objects": {
-            str(obj_id): {
-                "name": Path(mesh.path).name,
-                "path": f"models/obj_{obj_id:06d}.ply",
-                "texture": None if mesh.texture_rgb is None else f"models/obj_{obj_id:06d}.png",
-                "sha256": mesh.sha256,
-                "diameter_m": mesh.diameter_m,
-                "window_side_px": planned.windows_px[obj_id],
-            }
-            for obj_id, mesh in planned.meshes.items()
-        },
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "fx": float(camera.K[0, 0]),
-            "fy": float(camera.K[1, 1]),
-            "cx": float(camera.K[0, 2]),
-            "cy": float(camera.K[1, 2]),
-            "shared": shared,
-        },
-        "units": UNITS,
-        "versions": package_versions(),
-    }

@@ -1,4 +1,4 @@
-"""A dataset in other containers: one HDF5 file, or a folder of WebDataset tars. Streamed shard by shard."""
+"""Export of a dataset to an HDF5 file or a folder of WebDataset tars, streamed shard by shard."""
 
 import errno
 import io
@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import h5py
@@ -22,40 +22,73 @@ from posecore.shard import Field, ShardReader, field_table, n_shards
 
 from synthgen.machine import free_bytes
 
-Array = np.ndarray
 OnShard = Callable[[int], None]
+Layout = Literal["hdf5", "webdataset"]
 
 ALIASES = {"colors": "scene_rgb", "depth": "scene_depth_m"}
-"""BlenderProc's keys in an HDF5 file, and the fields that they are further names of."""
+"""BlenderProc's keys in an HDF5 file, and the fields that they alias."""
 
 PNG_FIELDS = ("scene_rgb", "hypothesis_rgb", "scene_mask", "scene_depth_m", "hypothesis_depth_m")
-"""Fields that are pictures in a tar; depth in 16 bits, of `depth_step_m` each."""
+"""Fields stored as PNG in a tar; depth in 16 bits, in steps of `depth_step_m`."""
 
 NPZ_FIELDS = ("scene_contour_cam_m", "hypothesis_contour_cam_m", "scene_distance_px", "hypothesis_distance_px")
 """Fields in a tar's `.npz`; all others are in its `.json`."""
 
 SUFFIXES = (".h5", ".hdf5")
-_ROWS_TOGETHER = 1024  # of fields that are no patches
-_SPARE_BYTES = 16 * 2**20  # for HDF5's own tables
+_ROWS_PER_CHUNK = 1024  # of fields other than patches
+_SPARE_BYTES = 16 * 2**20  # for HDF5's internal tables
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
-def to_hdf5(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard = lambda n: None) -> None:
-    """Write a complete dataset as one HDF5 file: a dataset per field, samples in front, in the field's unit.
+def export_dataset(
+    url: str,
+    out: Path,
+    layout: Layout,
+    *,
+    overwrite: bool = False,
+    on_start: OnShard = lambda n: None,
+    on_shard: OnShard = lambda n: None,
+) -> int:
+    """Write a complete dataset in another container; see `to_hdf5` and `to_webdataset`.
 
-    `colors` and `depth` are further names of the scene patch and its depth, as in BlenderProc's files. Every sample of
-    a patch is a chunk, compressed with gzip, which any HDF5 library reads. The root's attribute `data_card` is the
-    data card as JSON; the objects lie in `models/` as bytes.
+    Args:
+        url: Dataset.
+        out: File or folder.
+        layout: Container.
+        overwrite: Replace an existing `out`.
+        on_start: Called with the number of samples of the dataset.
+        on_shard: Called with the number of samples of each written shard.
+
+    Returns:
+        The number of samples.
+
+    Raises:
+        ShardError, ConfigError, StorageError: See `to_hdf5`.
+    """
+    refuse_existing(out, overwrite)
+    n = ShardReader(url).n
+    on_start(n)
+    write = to_hdf5 if layout == "hdf5" else to_webdataset
+    write(url, out, overwrite=overwrite, on_shard=on_shard)
+    return n
+
+
+def to_hdf5(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard = lambda n: None) -> None:
+    """Write a complete dataset as an HDF5 file: a dataset per field, sample axis first, in the field's unit.
+
+    `colors` and `depth` alias the scene patch and its depth, as in BlenderProc's files. Every patch is a chunk,
+    compressed with gzip, which any HDF5 library reads. The root's attribute `data_card` is the data card as JSON; the
+    objects are in `models/` as bytes.
 
     Args:
         url: Dataset.
         out: File; it appears when it is complete.
-        overwrite: Replace what is there.
-        on_shard: Told the samples of every shard that is written.
+        overwrite: Replace an existing `out`.
+        on_shard: Called with the number of samples of each written shard.
 
     Raises:
         ShardError: The dataset is incomplete or damaged.
-        ConfigError: The name is no HDF5 file's.
+        ConfigError: The name does not end in .h5 or .hdf5.
         StorageError: `out` exists or cannot be written.
     """
     if out.suffix.lower() not in SUFFIXES:
@@ -82,19 +115,19 @@ def to_hdf5(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard =
 def to_webdataset(url: str, out: Path, *, overwrite: bool = False, on_shard: OnShard = lambda n: None) -> None:
     """Write a complete dataset as a folder of tars, one a shard, in WebDataset's convention.
 
-    The files of sample 7 are neighbours named `00000007.*`: pictures (`PNG_FIELDS`, lossless), `labels.npz`
-    (`NPZ_FIELDS`) and `json` with everything else; all in the field's unit but for depth. `card.json` and `models/` lie
-    beside the tars.
+    The files of sample 7 are adjacent members `00000007.*`: `PNG_FIELDS` as lossless pictures, `NPZ_FIELDS` in
+    `labels.npz`, all others in `json`, in the field's unit except for depth. `card.json` and `models/` are beside the
+    tars.
 
     Args:
         url: Dataset.
         out: Folder; it appears when it is complete.
-        overwrite: Replace what is there.
-        on_shard: Told the samples of every shard that is written.
+        overwrite: Replace an existing `out`.
+        on_shard: Called with the number of samples of each written shard.
 
     Raises:
         ShardError: The dataset is incomplete or damaged.
-        ConfigError: The name is an HDF5 file's.
+        ConfigError: The name ends in .h5 or .hdf5.
         StorageError: `out` exists or cannot be written.
     """
     if out.suffix.lower() in SUFFIXES:
@@ -117,8 +150,8 @@ def to_webdataset(url: str, out: Path, *, overwrite: bool = False, on_shard: OnS
             on_shard(reader.n_samples(shard_id))
 
 
-def webdataset_files(sample: Mapping[str, Array], card: Mapping[str, Any]) -> dict[str, bytes]:
-    """The files of one sample by what follows its key."""
+def webdataset_files(sample: Mapping[str, np.ndarray], card: Mapping[str, Any]) -> dict[str, bytes]:
+    """Files of a sample by the suffix after its key."""
     table = {field.name: field for field in field_table()}
     files = {f"{name}.png": _png(table[name], sample[name], card) for name in PNG_FIELDS}
     files["labels.npz"] = _npz({name: sample[name] for name in NPZ_FIELDS})
@@ -129,7 +162,7 @@ def webdataset_files(sample: Mapping[str, Array], card: Mapping[str, Any]) -> di
 
 def _hdf5_dataset(file: h5py.File, field: Field, card: Mapping[str, Any]) -> None:
     n, size = int(card["n"]), field.size(card["patch_px"], card["contour_points"])
-    rows = 1 if "P" in field.shape else min(n, _ROWS_TOGETHER)
+    rows = 1 if "P" in field.shape else min(n, _ROWS_PER_CHUNK)
     made = file.create_dataset(
         field.name,
         shape=(n, *size),
@@ -142,15 +175,15 @@ def _hdf5_dataset(file: h5py.File, field: Field, card: Mapping[str, Any]) -> Non
     made.attrs["unit"], made.attrs["text"] = field.unit, field.text
 
 
-def _png(field: Field, values: Array, card: Mapping[str, Any]) -> bytes:
+def _png(field: Field, values: np.ndarray, card: Mapping[str, Any]) -> bytes:
     stored = field.encode(values, card)
     ok, data = cv2.imencode(".png", stored[..., ::-1] if stored.ndim == 3 else stored, _PNG)
     assert ok
     return data.tobytes()
 
 
-def _npz(arrays: Mapping[str, Array]) -> bytes:
-    """What np.savez_compressed makes, faster and without the time of day."""
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Bytes as of np.savez_compressed, but faster and without timestamps."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
         for name, values in arrays.items():
@@ -162,18 +195,18 @@ def _npz(arrays: Mapping[str, Array]) -> bytes:
 
 
 def complete_dataset(url: str) -> ShardReader:
-    """A dataset of which every shard is there; else a ShardError."""
+    """Open a dataset, and raise a ShardError unless every shard is committed."""
     reader = ShardReader(url)
     if not reader.complete:
         raise ShardError(
-            f"{url}: {len(reader.committed)} of {n_shards(reader.card)} shards are there; finish it first with the "
-            "`synthgen render` that began it"
+            f"{url}: {len(reader.committed)} of {n_shards(reader.card)} shards are committed; complete it first "
+            "with the `synthgen render` that began it"
         )
     return reader
 
 
 def _require_room(out: Path, size_bytes: int) -> None:
-    """Stop before the disk is full: HDF5 would say so, and then crash the process as it closes the file."""
+    """Stop before the disk is full: HDF5 would crash the process when it closes the file."""
     if free_bytes(out) < size_bytes + _SPARE_BYTES:
         raise storage_error(out, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), size_bytes)
 
@@ -184,10 +217,10 @@ def _models(reader: ShardReader) -> dict[str, bytes]:
 
 
 def model_keys(reader: ShardReader) -> list[str]:
-    """Where the objects' files lie. A card from elsewhere must not name places outside of the dataset.
+    """Keys of the objects' files. A foreign card must not point outside of the dataset.
 
     Raises:
-        ShardError: It does.
+        ShardError: A key is not a file in `models/`.
     """
     objects = reader.card.get("objects", {}).values()
     keys = [entry[part] for entry in objects for part in ("path", "texture") if entry.get(part)]
@@ -198,29 +231,29 @@ def model_keys(reader: ShardReader) -> list[str]:
     return keys
 
 
-def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, Array]]]:
+def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     for shard_id in reader.committed:
         yield shard_id, reader.read(shard_id)
 
 
 def refuse_existing(out: Path, overwrite: bool) -> None:
-    """Raise a StorageError when there is something under a name that is not to be replaced."""
+    """Raise a StorageError for an existing `out` that may not be replaced."""
     if out.exists() and not overwrite:
         raise StorageError(f"{out}: exists; choose another name, or add --overwrite to replace it")
 
 
 @contextmanager
 def _whole(out: Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary name beside `out` that takes its place when all went well, and goes away otherwise."""
+    """A temporary path beside `out`: renamed to `out` on success, removed otherwise."""
     refuse_existing(out, overwrite)
     if out.is_dir() and not (out / "card.json").is_file() and any(out.iterdir()):
-        raise StorageError(f"{out}: a folder that no export made, so it is not replaced; choose another name")
+        raise StorageError(f"{out}: is not an exported folder, so it is not replaced; choose another name")
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         try:
             out.parent.mkdir(parents=True, exist_ok=True)
-            for left in out.parent.glob(f".{out.name}.*.tmp"):  # of a killed export
-                _remove(left)
+            for leftover in out.parent.glob(f".{out.name}.*.tmp"):  # of a killed export
+                _remove(leftover)
             yield temporary
             if out.is_dir() or temporary.is_dir():
                 _remove(out)
@@ -242,6 +275,6 @@ def _remove(path: Path) -> None:
 
 
 def _as_storage_error(out: Path, error: OSError) -> StorageError:
-    """HDF5 hides the number of the error in its message."""
+    """The StorageError of an OSError, whose number HDF5 has only in its message."""
     hidden = re.search(r"errno = (\d+)", str(error))
     return storage_error(out, OSError(int(hidden[1]), os.strerror(int(hidden[1]))) if hidden else error)

@@ -1,1 +1,1 @@
-"""Datasets of any size: shards on processes and clusters, faults, locks, estimates."""
+"""The applications behind the commands: jobs of any size on processes and clusters, with faults and estimates."""

@@ -14,10 +14,10 @@ from posecore.processes import interrupts_ignored
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
 SETTINGS = {
     "distributed.worker.multiprocessing-method": "spawn",  # a forked Blender is undefined
-    # Of a task that loses its worker the pipeline decides: dask blames also those that only waited on that worker.
+    # The dispatcher handles tasks that lose their worker: dask also blames tasks that only waited on that worker.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.scheduler.work-stealing": False,
-    # A renderer's memory is not dask's: spilling or pausing frees none of it, a restart does.
+    # A renderer's memory is not dask's: only a restart frees it, spilling or pausing does not.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
@@ -25,13 +25,13 @@ SETTINGS = {
     "distributed.comm.timeouts.connect": "60s",
     # By default a worker that needs more than 15 s to start again, on a busy machine, is dropped for good.
     "distributed.deploy.lost-worker-timeout": "1h",
-    "distributed.logging": dict.fromkeys(_TALKATIVE, "critical"),  # for the workers, which read it when they start
+    "distributed.logging": dict.fromkeys(_TALKATIVE, "critical"),  # for the workers, which apply it at their start
 }
 ANSWER_S = 30.0
-"""Time for a scheduler to answer."""
+"""Timeout for the scheduler's answer."""
 _START_TRIES = 8
-_MEMORY_SHARE = 0.9  # of the machine, for all workers
-_LEAST_BYTES = 3 << 29  # a Blender with a large mesh lives in 1.5 GiB; with less, workers would be killed for nothing
+_MEMORY_FRACTION = 0.9  # of the machine, for all workers
+_LEAST_BYTES = 3 << 29  # Blender with a large mesh needs 1.5 GiB; a lower limit would kill sound workers
 
 
 @contextmanager
@@ -45,7 +45,7 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
     Raises:
         RenderError: The scheduler does not answer, or no process can be started.
     """
-    for name in list(logging.root.manager.loggerDict):  # they log every connection that breaks with its traceback
+    for name in list(logging.root.manager.loggerDict):  # they log a traceback for each broken connection
         if name.split(".")[0] in _TALKATIVE:  # some of distributed's loggers have levels of their own
             logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(SETTINGS):
@@ -61,20 +61,20 @@ def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 def memory_limit_bytes(workers: int) -> int:
     """Memory at which a local worker is restarted."""
-    return max(int(MEMORY_LIMIT * _MEMORY_SHARE / workers), min(_LEAST_BYTES, MEMORY_LIMIT))
+    return max(int(MEMORY_LIMIT * _MEMORY_FRACTION / workers), min(_LEAST_BYTES, MEMORY_LIMIT))
 
 
 def revive(local: LocalCluster, suspected: set[Any]) -> set[Any]:
-    """Start workers anew that the cluster has dropped, or whose nanny has given up.
+    """Restart workers that the cluster has dropped, or whose nanny has given up.
 
-    One that dies just when it starts is not always started again.
+    Dask does not always restart a worker that dies during its start.
 
     Args:
         local: The cluster.
-        suspected: Names of workers that had no process at the last look.
+        suspected: Names of workers without a process at the last call.
 
     Returns:
-        Names of those that have none now; pass them to the next look, some seconds later.
+        Names of workers without a process now, for the next call some seconds later.
     """
     nannies = {name: nanny for name, nanny in list(local.workers.items()) if isinstance(nanny, Nanny)}
     dead = {name for name, nanny in nannies.items() if not nanny.is_alive()}
@@ -99,7 +99,7 @@ def _local(workers: int) -> LocalCluster:
                 silence_logs=logging.CRITICAL,
                 memory_limit=memory_limit_bytes(workers),
             )
-        except (OSError, RuntimeError) as error:  # one died while it started
+        except (OSError, RuntimeError) as error:  # a worker died during its start
             if not tries_left:
                 raise RenderError(
                     f"--workers {workers}: the worker processes do not start ({_first_line(error)}); "

@@ -1,8 +1,8 @@
 """From a job to a complete dataset: shards on a cluster of processes, committed as they come back.
 
-A shard whose worker dies is rendered again. When that happens twice, its scenes are tried alone, one after the other,
-and one that kills its worker twice there is quarantined: another draw of it takes its place. Who is to blame is found
-in that search alone; a shard that only waited on a worker which another one killed loses time, nothing else.
+A shard whose worker dies is rendered again. After the second death its scenes are rendered alone, one by one. A scene
+that kills its worker twice alone is quarantined: another draw replaces it. Only this search identifies the scene; a
+shard that merely waited on a worker that died loses time alone.
 """
 
 import logging
@@ -24,7 +24,7 @@ from posecore.errors import PoseError, RenderError
 
 from synthgen.run import cluster
 from synthgen.run.shard_job import ShardJob, scenes_in
-from synthgen.run.worker import Outcome, RendererPlugin, render_shard, try_scene
+from synthgen.run.worker import RendererPlugin, TaskResult, render_shard, try_scene
 
 log = logging.getLogger(__name__)
 
@@ -33,14 +33,14 @@ OnShard = Callable[[shard.Encoded], None]
 MIN_TIMEOUT_S = 300.0
 FIRST_TIMEOUT_S = 3600.0
 TIMEOUT_MEDIANS = 20
-QUARANTINE_SHARE = 0.01
+QUARANTINE_FRACTION = 0.01
 QUARANTINE_FLOOR = 3
-_AHEAD = 2  # shards a worker has, one of them waiting, so that it never waits for the driver
-_CRASHES = 2  # deaths of a worker with a shard before its scenes are tried alone, and with a scene before quarantine
+_AHEAD = 2  # shards queued per worker, so that it never waits for the driver
+_CRASHES = 2  # worker deaths at a shard before its scenes are rendered alone, and at a scene before quarantine
 _SEARCHES = 5  # fruitless searches in one shard before the run stops
-_DEATHS_IN_A_ROW = 10  # and four for each worker, without a result in between, before the run stops
+_DEATHS_IN_A_ROW = 10  # plus four per worker, without a result in between, before the run stops
 _REGISTER_TRIES = 10
-_LOOK_S = 5.0  # between looks at the number of workers
+_POLL_S = 5.0  # between counts of the workers
 _LOST_S = 120.0  # without any local worker before the run stops
 
 
@@ -49,12 +49,12 @@ class _Shard:
     """A shard that is being rendered.
 
     Attributes:
-        id: Which.
-        crashes: Deaths of its worker since the last search.
-        searches: Searches among its scenes.
-        quarantined: Scenes that are replaced.
-        suspects: Scenes still to be tried alone in the present search, the next one last.
-        scene_crashes: Deaths and failures of scenes that were tried alone.
+        id: Index of the shard.
+        crashes: Worker deaths since the last search.
+        searches: Number of searches among its scenes.
+        quarantined: Replaced scenes.
+        suspects: Scenes still to be rendered alone in this search; the next scene is the last entry.
+        scene_crashes: Worker deaths and failures by scene, rendered alone.
     """
 
     id: int
@@ -79,18 +79,18 @@ def run(
     """Render every shard that is missing and commit it.
 
     Args:
-        job: What to render.
-        writer: Where to.
+        job: Dataset to render.
+        writer: Writer of the dataset.
         workers: Local processes; without effect with a scheduler.
         scheduler: Address of a running dask scheduler, or None for local processes.
         on_shard: Called after every commit; the manifest line in it lists quarantined scenes.
-        redo: Committed shards to render again, because they are damaged.
-        shard_timeout_s: Seconds after which a worker without result is killed and its shard done again; None takes
-            20 times the median of the shards so far, at least 5 minutes, and an hour until three are there.
+        redo: Committed shards to render again, e.g. because they are damaged.
+        shard_timeout_s: Seconds after which a worker without result is killed and its shard rendered again; None: 20
+            times the median of the finished shards, at least 5 minutes, and an hour until three are finished.
         gpus: See `RendererPlugin`.
 
     Raises:
-        PoseError: A scene cannot be drawn, the place cannot be written, workers keep dying, or too many scenes are
+        PoseError: A scene cannot be drawn, the dataset cannot be written, workers keep dying, or too many scenes are
             quarantined.
     """
     committed = set(writer.committed()) - set(redo)
@@ -109,19 +109,19 @@ def run(
             shard_timeout_s=shard_timeout_s,
         ).render(iter(missing))
         if scheduler is not None:
-            with suppress(OSError):  # all is rendered
+            with suppress(OSError):  # the dataset is complete
                 client.unregister_worker_plugin(plugin.name)
 
 
 class Dispatcher:
-    """Keeps the workers of a cluster busy with the shards of one job, and deals with what goes wrong.
+    """Distributes the shards of a job to the workers of a cluster and handles their faults.
 
     Args:
-        client: Of the cluster.
-        plugin: The job; registered.
-        writer: Where to.
+        client: Client of the cluster.
+        plugin: The job, registered with the cluster.
+        writer: Writer of the dataset.
         on_shard: Called after every commit.
-        local: Whether the workers are this machine's: when all are gone, none comes back.
+        local: Whether the workers are local processes, so that no new worker can join.
         shard_timeout_s: See `run`.
     """
 
@@ -148,7 +148,7 @@ class Dispatcher:
         self._deaths_in_a_row = 0
         self._quarantined = 0
         self._dead: set[Any] = set()
-        self._slots, self._looked_s, self._seen_s = 1, -_LOOK_S, time.monotonic()
+        self._slots, self._polled_s, self._connected_s = 1, -_POLL_S, time.monotonic()
 
     def render(self, missing: Iterator[int]) -> None:
         """Render and commit these shards.
@@ -158,25 +158,25 @@ class Dispatcher:
         """
         try:
             self._render(missing)
-        except CommClosedError as error:  # of the scheduler: workers that break off are the scheduler's business
+        except CommClosedError as error:  # from the scheduler, which handles broken workers itself
             raise self._lost() from error
 
     def _render(self, missing: Iterator[int]) -> None:
         while True:
-            self._look()
+            self._count_workers()
             while len(self._flying) < _AHEAD * self._slots and (shard_id := next(missing, None)) is not None:
                 self._submit(_Shard(id=shard_id))
             if not self._flying:
                 return
             try:
-                future = self._done.get(timeout=_LOOK_S)
+                future = self._done.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
             self._take(future, *self._flying.pop(str(future.key)))
             future.release()
 
     def timeout_s(self) -> float:
-        """Seconds that a shard may take now."""
+        """Current time limit of a shard, seconds."""
         if self._shard_timeout_s is not None:
             return self._shard_timeout_s
         if len(self._seconds) < 3:
@@ -196,7 +196,7 @@ class Dispatcher:
 
     def _take(self, future: Future, work: _Shard, scene: int | None) -> None:
         try:
-            outcome: Outcome = future.result()
+            outcome: TaskResult = future.result()
         except KilledWorker:
             self._worker_died(str(future.key), work, scene)
             return
@@ -215,7 +215,7 @@ class Dispatcher:
                 work.suspects.pop()
             self._search_on(work)
         elif outcome.encoded is None:
-            log.info("shard %d: %s; its scenes are tried alone", work.id, outcome.failure)
+            log.info("shard %d: %s; its scenes are rendered alone", work.id, outcome.failure)
             self._search(work)
         else:
             self._seconds.append(outcome.seconds)
@@ -250,12 +250,12 @@ class Dispatcher:
         self._search_on(work)
 
     def _search(self, work: _Shard) -> None:
-        """Try the scenes of a shard alone, one after the other."""
+        """Render the scenes of a shard alone, one by one."""
         work.searches += 1
         if work.searches > _SEARCHES:
             raise RenderError(
                 f"shard {work.id}: its worker died {_SEARCHES * _CRASHES} times (killed, out of memory, or without a "
-                f"result for {self.timeout_s():.0f} s), though each of its scenes renders alone; start the same "
+                f"result for {self.timeout_s():.0f} s), though each scene renders alone; start the same "
                 "command again with fewer --workers or a longer --shard-timeout"
             )
         work.crashes = 0
@@ -281,20 +281,20 @@ class Dispatcher:
         work.scene_crashes[scene] = 0
         self._quarantined += 1
         scenes = -(-int(self._plugin.job.card["n"]) // self._plugin.job.config.hypotheses_per_scene)
-        allowed = max(QUARANTINE_FLOOR, int(QUARANTINE_SHARE * scenes))
+        allowed = max(QUARANTINE_FLOOR, int(QUARANTINE_FRACTION * scenes))
         if self._quarantined > allowed:
             raise RenderError(
                 f"scene {scene}: the renderer fails at more than {allowed} of {scenes} scenes, last with: {reason}; "
-                "look at the mesh, or use another --engine"
+                "check the mesh, or use another --engine"
             )
         log.warning("scene %d is quarantined and drawn anew: it failed %d times (%s)", scene, _CRASHES, reason)
 
-    def _look(self) -> None:
-        """Count the workers from time to time: they come and go."""
+    def _count_workers(self) -> None:
+        """Update the number of workers, every few seconds, as they join and leave."""
         now = time.monotonic()
-        if now - self._looked_s < _LOOK_S:
+        if now - self._polled_s < _POLL_S:
             return
-        self._looked_s = now
+        self._polled_s = now
         if self._client.status != "running":
             raise self._lost()
         try:
@@ -305,12 +305,12 @@ class Dispatcher:
         if isinstance(self._client.cluster, LocalCluster):
             self._dead = cluster.revive(self._client.cluster, self._dead)
         if threads:
-            self._seen_s = now
-        elif now - self._seen_s > _LOST_S:
+            self._connected_s = now
+        elif now - self._connected_s > _LOST_S:
             if self._local:
                 raise RenderError("all worker processes are gone and do not start again; start the same command again")
             log.warning("no worker is connected to the scheduler; waiting for one")
-            self._seen_s = now
+            self._connected_s = now
 
     def _lost(self) -> RenderError:
         return RenderError("the scheduler is gone; start it and its workers, then the same command again")
@@ -319,11 +319,11 @@ class Dispatcher:
 def _register(client: Client, plugin: RendererPlugin) -> None:
     try:
         for _ in range(_REGISTER_TRIES):
-            with suppress(OSError):  # a worker died while it was told
+            with suppress(OSError):  # a worker died during the registration
                 client.register_plugin(plugin)
                 return
         client.register_plugin(plugin)
-    except Exception as error:  # whatever a worker raises that cannot unpickle the job
+    except Exception as error:  # any error of a worker that cannot unpickle the job
         text = str(error).splitlines()[0] if str(error) else ""
         raise RenderError(
             f"the workers cannot take the job ({type(error).__name__}: {text}); install the same version of synthgen "
@@ -332,11 +332,11 @@ def _register(client: Client, plugin: RendererPlugin) -> None:
 
 
 def progress(job: ShardJob, writer: shard.ShardWriter, redo: Collection[int] = ()) -> tuple[int, int]:
-    """Samples that are committed, less those of the shards to redo, and all of them."""
+    """Number of committed samples without the shards to redo, and number of samples of the dataset."""
     card: Mapping[str, Any] = job.card
     return sum(shard.samples_in(card, i) for i in set(writer.committed()) - set(redo)), int(card["n"])
 
 
 def threads_per_worker(workers: int, cores: int) -> int:
-    """Threads that each worker's renderer may use."""
+    """Number of threads for each worker's renderer."""
     return max(1, cores // max(1, workers))

@@ -1,120 +1,75 @@
-"""What a dataset will take, from a few scenes rendered and encoded here, and whether there is room for it."""
+"""Time and size of a dataset, estimated from a few scenes that are rendered and encoded in a process of their own."""
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
 from posecore import shard
-from posecore.errors import PoseError, RenderError, StorageError
+from posecore.errors import PoseError, RenderError
 from posecore.processes import die_with_parent
 
-from synthgen.machine import free_bytes, size_text
 from synthgen.pairs.pair_maker import concatenate
 from synthgen.run.shard_job import ShardJob, ShardRenderer, scenes_in
 
 _START_S = 300.0  # for Blender to start and the first scene to compile its kernels
-_SPARE_BYTES = 256 * 2**20  # of a disk that is not filled to the last byte
 _MANIFEST_BYTES = 700  # of a shard's line
 
 
 @dataclass(frozen=True, kw_only=True)
-class Estimate:
-    """What one pair takes.
+class RunEstimate:
+    """Measured time and size of pairs.
 
     Attributes:
-        bytes_per_pair: On disk.
-        seconds_per_pair: Of one worker, after its start; workers side by side on the same cores take longer each.
-        pairs: How many were measured.
+        pairs: Measured pairs.
+        seconds: Rendering time of the measured pairs, without the start of processes and engines.
+        bytes_per_pair: Size on disk.
+        memory_bytes: Memory of all processes at the end; 0 where it is not measured.
     """
 
-    bytes_per_pair: float
-    seconds_per_pair: float
     pairs: int
+    seconds: float
+    bytes_per_pair: float
+    memory_bytes: int = 0
 
-    def bytes(self, n: int) -> int:
+    @property
+    def seconds_per_pair(self) -> float:
+        """Time per pair."""
+        return self.seconds / self.pairs
+
+    def size_bytes(self, n: int) -> int:
         """Size of n pairs."""
         return round(n * self.bytes_per_pair)
 
-    def seconds(self, n: int, workers: int) -> float:
-        """Time for n pairs with so many workers, each with its own core or GPU."""
+    def duration_s(self, n: int, workers: int = 1) -> float:
+        """Time of n pairs on so many workers at the measured speed, each with its own core or GPU."""
         return n * self.seconds_per_pair / max(1, workers)
 
 
-def estimate(job: ShardJob, *, scenes: int = 4, most_seconds: float = 20.0) -> Estimate:
-    """Render and encode the first scenes of a job in a process of their own, and throw them away.
+def estimate(job: ShardJob, *, scenes: int = 4, most_seconds: float = 20.0) -> RunEstimate:
+    """Render and encode the first scenes of a job, on one worker; nothing is written.
 
-    Nothing is imported, started or left in the calling process, and nothing is written. The first scene is not timed:
-    it holds the start of the engine.
+    The first scene is not timed: it holds the start of the engine. Workers that share cores take longer each.
 
     Args:
         job: The dataset.
-        scenes: How many to measure beside the first.
-        most_seconds: No further scene is begun after that long.
+        scenes: Scenes to measure beside the first.
+        most_seconds: Time after which no further scene is begun.
 
     Raises:
-        PoseError: What the renderer raised: these settings cannot be rendered here.
-        RenderError: The process died, which a crashing renderer does, or gave no answer in time.
+        PoseError: These settings cannot be rendered here.
+        RenderError: The renderer crashed or gave no result in time.
     """
-    command = [sys.executable, "-c", "from synthgen.run.estimate import main; main()"]
-    seconds = _START_S + most_seconds
-    # Not multiprocessing: that waits for ever when its process is killed while it starts.
-    try:
-        done = subprocess.run(
-            command,
-            input=pickle.dumps((job, scenes, most_seconds)),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            timeout=seconds,
-            check=True,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise RenderError(f"the first scenes gave no result in {seconds:.0f} s") from error
-    except subprocess.CalledProcessError as error:
-        raise RenderError(f"the renderer died at the first scenes, exit code {error.returncode}") from error
-    answer: Estimate | PoseError = pickle.loads(done.stdout)
-    if isinstance(answer, PoseError):
-        raise answer
-    return answer
+    return in_own_process(measure_scenes, job, scenes, most_seconds, timeout_s=_START_S + most_seconds)
 
 
-def check_free_space(url: str, needed_bytes: int) -> None:
-    """See that the disk of a folder, or of the nearest folder above that exists, has room; URLs are not looked at.
-
-    Args:
-        url: Where the dataset goes.
-        needed_bytes: What is still to be written there.
-
-    Raises:
-        StorageError: It has not; the message says what is free, what is needed and what to do.
-    """
-    if "://" in url:
-        return
-    free = free_bytes(Path(url))
-    if free < needed_bytes + _SPARE_BYTES:
-        raise StorageError(
-            f"{url}: {size_text(free)} free, about {size_text(needed_bytes + _SPARE_BYTES)} needed; free some space, "
-            "choose another --out, or a smaller --n"
-        )
-
-
-def main() -> None:
-    """The process of `estimate`: a job on stdin; on stdout an estimate, or the error that says why there is none."""
-    die_with_parent()
-    with os.fdopen(os.dup(1), "wb") as out:
-        os.dup2(2, 1)  # Blender talks there
-        answer: Estimate | PoseError
-        try:
-            answer = measured(*pickle.load(sys.stdin.buffer))
-        except PoseError as error:
-            answer = error
-        out.write(pickle.dumps(answer))
-
-
-def measured(job: ShardJob, scenes: int, most_seconds: float) -> Estimate:
+def measure_scenes(job: ShardJob, scenes: int, most_seconds: float) -> RunEstimate:
     """The estimate, rendered in this process. See `estimate`."""
     renderer = ShardRenderer(job)
     try:
@@ -133,8 +88,57 @@ def measured(job: ShardJob, scenes: int, most_seconds: float) -> Estimate:
     count = len(arrays["obj_id"])
     began = time.perf_counter()
     encoded = shard.encode({**job.card, "n": count, "shard_size": count}, 0, arrays)
-    per_pair = rendered / timed + (time.perf_counter() - began) / count
+    seconds = count * rendered / timed + time.perf_counter() - began
     line = _MANIFEST_BYTES / job.config.shard_size
-    return Estimate(
-        bytes_per_pair=sum(map(len, encoded.files.values())) / count + line, seconds_per_pair=per_pair, pairs=count
+    return RunEstimate(
+        pairs=count, seconds=seconds, bytes_per_pair=sum(map(len, encoded.files.values())) / count + line
     )
+
+
+def in_own_process(function: Callable[..., Any], *arguments: Any, timeout_s: float) -> Any:
+    """Result of a module's function, called in a new process: nothing is imported or started in this one.
+
+    Args:
+        function: Function at the top of a module.
+        arguments: Its arguments, picklable.
+        timeout_s: Time after which the process and its children are killed.
+
+    Raises:
+        PoseError: Raised by the function.
+        RenderError: The process died, as a crashing renderer does, or gave no result in time.
+    """
+    # Not multiprocessing: its parent waits for ever for a process that is killed while it starts.
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from synthgen.run.estimate import main; main()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,  # its children are in its process group
+    )
+    try:
+        answer, _ = process.communicate(pickle.dumps((function, arguments)), timeout=timeout_s)
+    except subprocess.TimeoutExpired as error:
+        raise RenderError(f"the renderer gave no result in {timeout_s:.0f} s") from error
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.returncode:
+        raise RenderError(f"the renderer died at the first scenes, exit code {process.returncode}")
+    result = pickle.loads(answer)
+    if isinstance(result, PoseError):
+        raise result
+    return result
+
+
+def main() -> None:
+    """Body of the new process: a pickled call on stdin; its result, or the PoseError that it raised, on stdout."""
+    die_with_parent()
+    with os.fdopen(os.dup(1), "wb") as out:
+        os.dup2(2, 1)  # Blender writes to stdout
+        function, arguments = pickle.load(sys.stdin.buffer)
+        try:
+            result = function(*arguments)
+        except PoseError as error:
+            result = error
+        out.write(pickle.dumps(result))

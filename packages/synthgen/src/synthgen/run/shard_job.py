@@ -1,4 +1,4 @@
-"""What a worker process does: whole shards, from a job that is sent once to every worker."""
+"""Rendering of whole shards, from a job that is sent once to every worker."""
 
 import threading
 from collections.abc import Collection, Mapping
@@ -16,23 +16,23 @@ from synthgen.inputs.assets import Assets
 from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
 
 REPLACEMENT_ATTEMPT = 50
-"""A scene in quarantine is drawn from this attempt on; its manifest line lists it under `quarantined`."""
+"""First attempt of the draws that replace a quarantined scene; its manifest line lists it under `quarantined`."""
 
 
 class SceneError(RenderError):
-    """One scene cannot be rendered, which says nothing of the others."""
+    """A scene cannot be rendered; others may be."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShardJob:
-    """Everything that decides a dataset, ready to be pickled.
+    """Complete definition of a dataset, picklable.
 
     Attributes:
         config: Recipe.
-        card: The dataset's card.
+        card: Data card.
         meshes: Objects by id.
         assets: Photographs, panoramas and occluder meshes.
-        threads: Threads of a Blender engine.
+        threads: Number of threads of a Blender engine.
     """
 
     config: SynthConfig
@@ -43,10 +43,9 @@ class ShardJob:
 
 
 class ShardRenderer:
-    """Renders shards of a job with engines that are kept between them.
+    """Renders shards of a job with engines that persist between shards.
 
-    Engines are made at the first shard and in its thread, because GL contexts and Blender belong to the thread that
-    made them.
+    Engines are created at the first shard, in its thread, because GL contexts and Blender are bound to a thread.
     """
 
     def __init__(self, job: ShardJob) -> None:
@@ -54,10 +53,10 @@ class ShardRenderer:
         self._local = threading.local()
 
     def prepare(self) -> None:
-        """Make the engines of this thread, unless they are there.
+        """Create the engines of this thread, unless they exist.
 
         Raises:
-            RenderError: One cannot start here.
+            RenderError: An engine cannot start here.
         """
         self._maker()
 
@@ -65,9 +64,8 @@ class ShardRenderer:
         """Render one shard and encode it for the writer.
 
         Args:
-            shard_id: Which one.
-            quarantined: Scene indices that get another draw than the first acceptable one; the manifest line lists
-                those of this shard.
+            shard_id: Index of the shard.
+            quarantined: Scene indices to replace by another draw; the manifest line lists the shard's own.
 
         Raises:
             SceneError: The renderer failed at a scene.
@@ -82,7 +80,7 @@ class ShardRenderer:
         return encoded
 
     def scene(self, shard_id: int, scene_index: int, quarantined: Collection[int] = ()) -> dict[str, np.ndarray]:
-        """Render the samples of one scene of a shard. See `render`."""
+        """Render the samples of a scene. See `render`."""
         maker = self._maker()
         first_attempt = REPLACEMENT_ATTEMPT if scene_index in quarantined else 0
         try:
@@ -108,7 +106,7 @@ class ShardRenderer:
 
 
 def scenes_in(job: ShardJob, shard_id: int) -> dict[int, int]:
-    """Scenes of a shard in their order, and how many samples of each it holds."""
+    """Scenes of a shard in their order, with their number of samples in the shard."""
     h = job.config.hypotheses_per_scene
     count = shard.samples_in(job.card, shard_id)
     first = shard_id * job.config.shard_size // h

@@ -1,4 +1,4 @@
-"""What runs in a worker process: the job's plugin, its two tasks, and what ends a worker that hangs or bloats."""
+"""Worker process: the job's plugin, its two tasks, and limits on time and memory growth."""
 
 import faulthandler
 import json
@@ -25,17 +25,17 @@ from synthgen.pairs import data_card
 from synthgen.run.shard_job import SceneError, ShardJob, ShardRenderer
 
 GROWTH_LIMIT_BYTES = 1 << 30
-_RECYCLE_S = 0.5  # a rescheduled shard bounces between scheduler and worker until the worker is marked as leaving
-_FETCH_S = 60.0  # until the driver has fetched what this worker has rendered
+_RECYCLE_S = 0.5  # until the scheduler marks the worker as leaving; a shard rescheduled earlier would come back to it
+_FETCH_S = 60.0  # until the driver has fetched the rendered shards
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
-    """What came of a task.
+class TaskResult:
+    """Result of a task.
 
     Attributes:
-        encoded: The shard, None for a scene tried alone and for a failure.
-        failure: What the renderer said when it failed at a scene, else None.
+        encoded: The shard; None for a scene rendered alone and for a failure.
+        failure: Error message of the renderer, else None.
         seconds: Wall time of the task without the start of the engines.
     """
 
@@ -45,15 +45,15 @@ class Outcome:
 
 
 class RendererPlugin(WorkerPlugin):
-    """Gives every worker the job, also one that joins late or replaces one that crashed.
+    """Passes the job to every worker, including late ones and replacements.
 
-    Its name, and the tasks' keys with it, are the job's own: several jobs may share a cluster, where one name would
-    have one job's shards rendered with another's recipe.
+    Its name and the tasks' keys are unique to the job: with equal names, jobs that share a cluster would render each
+    other's shards.
 
     Args:
-        job: What to render.
-        gpus: What CUDA_VISIBLE_DEVICES calls this machine's GPUs; worker k sees only the k-th, counted in a circle.
-            Empty leaves the environment of each worker as it is.
+        job: Dataset to render.
+        gpus: Names of this machine's GPUs for CUDA_VISIBLE_DEVICES; worker k uses number k modulo their count. Empty
+            keeps each worker's environment.
     """
 
     def __init__(self, job: ShardJob, gpus: tuple[str, ...] = ()) -> None:
@@ -65,47 +65,46 @@ class RendererPlugin(WorkerPlugin):
         self.first_rss: int | None = None
 
     def setup(self, worker: Worker) -> None:
-        """Called on the worker when it starts. It never fails, or the worker would start again for ever."""
+        """Called at the worker's start. It must not fail, or the worker would restart for ever."""
         scratch.sweep()
         if worker.nanny is not None:
             die_with_parent()
             forget_blenders_paths()
-        # A paused worker waits for memory that only a restart would free.
+        # A paused worker would wait for memory that only a restart frees.
         worker.memory_manager.memory_pause_fraction = False
         if self.gpus:
             os.environ["CUDA_VISIBLE_DEVICES"] = self.gpus[int(worker.name) % len(self.gpus)]
-        self.problem = problem_with(self.job, worker.state.nthreads)
+        self.problem = find_problem(self.job, worker.state.nthreads)
         self.renderer = ShardRenderer(self.job)
 
 
-def render_shard(plugin: str, shard_id: int, quarantined: Collection[int], timeout_s: float) -> Outcome:
+def render_shard(plugin: str, shard_id: int, quarantined: Collection[int], timeout_s: float) -> TaskResult:
     """Task: a whole shard."""
-    found = _plugin(plugin)
-    renderer = _ready(found, timeout_s)
+    job_plugin = _plugin(plugin)
+    renderer = _ready(job_plugin, timeout_s)
     started = time.monotonic()
     try:
         with _killed_after(timeout_s):
             encoded = renderer.render(shard_id, quarantined)
     except SceneError as error:
-        return Outcome(failure=str(error), seconds=time.monotonic() - started)
-    if found.first_rss is None:
-        found.first_rss = psutil.Process().memory_info().rss
-    return Outcome(encoded=encoded, seconds=time.monotonic() - started)
+        return TaskResult(failure=str(error), seconds=time.monotonic() - started)
+    if job_plugin.first_rss is None:
+        job_plugin.first_rss = psutil.Process().memory_info().rss
+    return TaskResult(encoded=encoded, seconds=time.monotonic() - started)
 
 
 def try_scene(
     plugin: str, shard_id: int, scene: int, quarantined: Collection[int], timeout_s: float, mark: str
-) -> Outcome:
-    """Task: one scene of a shard alone, to see whether it crashes.
+) -> TaskResult:
+    """Task: a scene alone, to find out whether it crashes.
 
     Args:
         plugin: Name of the job's plugin.
-        shard_id: Shard of the scene.
+        shard_id: Index of the scene's shard.
         scene: Index of the scene.
         quarantined: See `ShardRenderer.render`.
-        timeout_s: Seconds until the worker counts as hanging.
-        mark: Event to set when all is ready and only the scene itself is left. A worker that dies before it died of
-            something else.
+        timeout_s: Time limit, seconds.
+        mark: Event to set right before the scene is rendered: a worker that dies without it died of another cause.
     """
     renderer = _ready(_plugin(plugin), timeout_s)
     Event(mark).set()
@@ -114,14 +113,14 @@ def try_scene(
         with _killed_after(timeout_s):
             renderer.scene(shard_id, scene, quarantined)
     except SceneError as error:
-        return Outcome(failure=str(error), seconds=time.monotonic() - started)
-    return Outcome(seconds=time.monotonic() - started)
+        return TaskResult(failure=str(error), seconds=time.monotonic() - started)
+    return TaskResult(seconds=time.monotonic() - started)
 
 
 def _plugin(name: str) -> RendererPlugin:
-    found = get_worker().plugins[name]
-    assert isinstance(found, RendererPlugin)
-    return found
+    job_plugin = get_worker().plugins[name]
+    assert isinstance(job_plugin, RendererPlugin)
+    return job_plugin
 
 
 def _ready(plugin: RendererPlugin, timeout_s: float) -> ShardRenderer:
@@ -135,7 +134,7 @@ def _ready(plugin: RendererPlugin, timeout_s: float) -> ShardRenderer:
 
 
 def _recycle_if_bloated(plugin: RendererPlugin) -> None:
-    """Have the nanny start this process anew when it has grown much since its first shard; the task goes elsewhere."""
+    """Restart this process through its nanny, and reschedule its task, when its memory has grown too much."""
     worker = get_worker()
     limit = worker.memory_manager.memory_limit
     allowed = min(GROWTH_LIMIT_BYTES, limit // 4) if limit else GROWTH_LIMIT_BYTES
@@ -143,7 +142,7 @@ def _recycle_if_bloated(plugin: RendererPlugin) -> None:
         return
     if psutil.Process().memory_info().rss - plugin.first_rss > allowed:
         deadline = time.monotonic() + _FETCH_S
-        while worker.data and time.monotonic() < deadline:  # a shard that is not fetched yet would be lost
+        while worker.data and time.monotonic() < deadline:  # shards that are not fetched yet would be lost
             time.sleep(0.02)
         worker.loop.add_callback(worker.close_gracefully, restart=True, reason="synthgen-memory-growth")
         time.sleep(_RECYCLE_S)
@@ -152,9 +151,9 @@ def _recycle_if_bloated(plugin: RendererPlugin) -> None:
 
 @contextmanager
 def _killed_after(timeout_s: float) -> Iterator[None]:
-    """End this process if the block takes longer.
+    """Kill this process if the block takes longer.
 
-    The clock is a thread of C code: it goes off also while Blender holds Python's global lock.
+    The timer is a C thread, independent of Python's global lock, which Blender may hold.
     """
     with Path(os.devnull).open("w") as nowhere:
         faulthandler.dump_traceback_later(timeout_s, exit=True, file=nowhere)
@@ -164,20 +163,20 @@ def _killed_after(timeout_s: float) -> Iterator[None]:
             faulthandler.cancel_dump_traceback_later()
 
 
-def problem_with(job: ShardJob, threads: int) -> str | None:
-    """Why this worker cannot render the job, None if it can."""
+def find_problem(job: ShardJob, threads: int) -> str | None:
+    """Reason why this worker cannot render the job, or None."""
     here = f"worker on {socket.gethostname()}"
     if threads != 1:
         return (
             f"{here}: has {threads} threads, expected 1 since Blender renders one scene at a time in a process; start "
             f"it with `dask worker ADDRESS --nthreads 1 --nworkers {threads}`"
         )
-    wanted: Mapping[str, Any] = job.card.get("versions", {})
-    found = data_card.versions(job.config) if wanted else {}
-    for name in sorted(wanted):
-        if found.get(name) != wanted[name]:
+    required: Mapping[str, Any] = job.card.get("versions", {})
+    installed = data_card.versions(job.config) if required else {}
+    for name in sorted(required):
+        if installed.get(name) != required[name]:
             return (
-                f"{here}: has {name} {found.get(name)}, the command {wanted[name]}, which may make other bytes; "
+                f"{here}: has {name} {installed.get(name)}, the command {required[name]}, which may make other bytes; "
                 "install the same versions on all machines"
             )
     pictures = (*job.assets.photos, *job.assets.hdris)

@@ -1,1 +1,1 @@
-"""Proof that a shard dataset is what its card says: named checks, coverage, and a page that shows both."""
+"""Verification of a shard dataset against its data card: named checks, coverage, and a page with both."""

@@ -1,4 +1,4 @@
-"""Where a dataset's samples lie: the numbers behind the histograms."""
+"""Distribution of a dataset's samples: the numbers behind the histograms."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,25 +6,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from synthgen.verify.checks import centres_cam_m, moved_diameters, perturbation_deg
-from synthgen.verify.facts import Batch, Facts
+from synthgen.verify.facts import Facts, SampleBatch
+from synthgen.verify.pose_checks import centres_cam_m, perturbation_deg, translation_diameters
 
-Array = np.ndarray
-Coverage = Mapping[str, Array]
+Coverage = Mapping[str, np.ndarray]
 """Numbers by name, one row a sample."""
 
 
-def coverage_of(batch: Batch) -> dict[str, Array]:
-    """What the histograms show of each sample.
+def measure_coverage(batch: SampleBatch) -> dict[str, np.ndarray]:
+    """Coverage numbers of each sample.
 
     Returns:
         view: (n, 3) unit vector from the object's box centre to the camera, object frame.
-        roll_deg: Turn of the object in the image plane, of its z axis (x where the camera looks along z).
+        roll_deg: In-plane rotation of the object's z axis (of its x axis where the view is along z).
         distance_m: Camera z of the box centre.
         distance_diameters: The same in diameters.
-        angle_deg, moved_diameters: Distance of the hypothesis.
+        angle_deg, translation_diameters: Distance between ground truth and hypothesis.
         visible_fraction: As stored.
-        u, v: Window centre as a share of the image.
+        u, v: Window centre as a fraction of the image.
         scene, obj_id, rejected: As stored.
     """
     T, centre = batch["T_cam_obj"], centres_cam_m(batch, "T_cam_obj")
@@ -38,9 +37,9 @@ def coverage_of(batch: Batch) -> dict[str, Array]:
         "view": view,
         "roll_deg": np.rad2deg(np.arctan2(axis[:, 0], -axis[:, 1])),
         "distance_m": centre[:, 2],
-        "distance_diameters": centre[:, 2] / batch.facts.of_objects(batch["obj_id"], "diameter_m"),
+        "distance_diameters": centre[:, 2] / batch.facts.object_values(batch["obj_id"], "diameter_m"),
         "angle_deg": perturbation_deg(batch),
-        "moved_diameters": moved_diameters(batch),
+        "translation_diameters": translation_diameters(batch),
         "visible_fraction": batch["visible_fraction"].astype(np.float64),
         "u": (x0 + side / 2) / batch.facts.camera.width_px,
         "v": (y0 + side / 2) / batch.facts.camera.height_px,
@@ -50,18 +49,18 @@ def coverage_of(batch: Batch) -> dict[str, Array]:
     }
 
 
-def joined(parts: Sequence[Coverage]) -> dict[str, Array]:
+def joined(parts: Sequence[Coverage]) -> dict[str, np.ndarray]:
     """Rows of several shards after one another."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 
-def scenes_of(coverage: Coverage) -> dict[str, Array]:
-    """The first sample of each object in each scene: what belongs to the truth counts once there."""
+def by_scene(coverage: Coverage) -> dict[str, np.ndarray]:
+    """The first sample of each object in each scene, for numbers of the ground truth."""
     _, first = np.unique(np.stack([coverage["scene"], coverage["obj_id"]]), axis=1, return_index=True)
     return {name: values[first] for name, values in coverage.items()}
 
 
-def lambert_xy(direction: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
+def lambert_xy(direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Lambert's azimuthal equal-area map of unit directions, each hemisphere around its own pole.
 
     The pole (z = +1 or -1) is at (0, 0), the equator at radius 1; equal areas on the sphere stay equal. Azimuth runs
@@ -73,11 +72,11 @@ def lambert_xy(direction: Float[Array, "n 3"]) -> Float[Array, "n 2"]:
 
 
 def sectors_in(ring: Any) -> Any:
-    """Cells of a ring of the map: with as many, all cells of all rings have the same area and are nearly square."""
+    """Number of cells in a ring of the map; with it all cells have equal area and are nearly square."""
     return 3 * (2 * ring + 1)
 
 
-def view_counts(view: Float[Array, "n 3"], rings: int) -> tuple[Int[Array, " c"], Int[Array, " c"]]:
+def view_counts(view: Float[np.ndarray, "n 3"], rings: int) -> tuple[Int[np.ndarray, " c"], Int[np.ndarray, " c"]]:
     """Directions in each cell of the two hemispheres' maps, (upper, lower).
 
     Ring k lies between the radii k / rings and (k + 1) / rings and is cut into `sectors_in(k)` cells from +x on,
@@ -86,9 +85,9 @@ def view_counts(view: Float[Array, "n 3"], rings: int) -> tuple[Int[Array, " c"]
     finite = view[np.isfinite(view).all(axis=1)]
     xy = lambert_xy(finite)
     ring = np.minimum((np.linalg.norm(xy, axis=1) * rings).astype(int), rings - 1)
-    turn = np.arctan2(xy[:, 1], xy[:, 0]) / (2 * np.pi) % 1.0
+    azimuth = np.arctan2(xy[:, 1], xy[:, 0]) / (2 * np.pi) % 1.0
     sectors = sectors_in(ring)
-    cell = 3 * ring**2 + np.minimum((turn * sectors).astype(int), sectors - 1)
+    cell = 3 * ring**2 + np.minimum((azimuth * sectors).astype(int), sectors - 1)
     upper = finite[:, 2] >= 0
     return (
         np.bincount(cell[upper], minlength=3 * rings**2),
@@ -99,7 +98,14 @@ def view_counts(view: Float[Array, "n 3"], rings: int) -> tuple[Int[Array, " c"]
 def summary(coverage: Coverage, facts: Facts) -> dict[str, object]:
     """Coverage in a few numbers, for JSON: quantiles 0, 0.25, 0.5, 0.75, 1, and samples by object."""
     result: dict[str, object] = {}
-    for name in ("distance_m", "distance_diameters", "angle_deg", "moved_diameters", "visible_fraction", "rejected"):
+    for name in (
+        "distance_m",
+        "distance_diameters",
+        "angle_deg",
+        "translation_diameters",
+        "visible_fraction",
+        "rejected",
+    ):
         finite = coverage[name][np.isfinite(coverage[name])] if coverage else np.zeros(0)
         result[name] = np.quantile(finite, [0, 0.25, 0.5, 0.75, 1]).tolist() if len(finite) else None
     counts = coverage["obj_id"] if coverage else np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""The report of a verification as one HTML file: light, readable from 360 px on, nothing loaded from elsewhere."""
+"""Verification report as a self-contained HTML page, readable from 360 px width on."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -12,13 +12,11 @@ from posecore.shard import ShardReader
 
 from synthgen.inspect.preview import Image, sample_row, title_row
 from synthgen.verify import plots
-from synthgen.verify.coverage import scenes_of, view_counts
-from synthgen.verify.findings import Finding, Report
-
-Array = np.ndarray
+from synthgen.verify.coverage import by_scene, view_counts
+from synthgen.verify.findings import Finding, VerificationReport
 
 SHOWN = 6  # samples of each contact sheet
-_PER_CELL = 8  # scenes that a cell of the sphere would hold if views were even
+_PER_CELL = 8  # scenes a cell of the sphere for a uniform distribution of views
 
 STYLE = """
 :root { color-scheme: light; --ink: #1c2330; --soft: #5b6472; --line: #dfe3ea; --wash: #f5f7fa; }
@@ -58,7 +56,7 @@ dt { font-weight: 600; } dd { margin: 0; overflow-wrap: anywhere; }
 """
 
 
-def report_page(report: Report) -> str:
+def report_page(report: VerificationReport) -> str:
     """The HTML document."""
     title = f"Verification of {report.url}"
     body = [
@@ -66,7 +64,7 @@ def report_page(report: Report) -> str:
         _section("Checks", _checks_table(report.findings), _checks_notes(report)),
         _section("Coverage", _coverage(report)),
         _section("Failed samples", _sheet(report, report.failed_samples()[:SHOWN], "Failed samples")),
-        _section("Samples drawn at random", _sheet(report, _random_samples(report), "Samples drawn at random")),
+        _section("Random samples", _sheet(report, _random_samples(report), "Random samples")),
         _section("Data card", _card(report)),
         "</main>",
     ]
@@ -82,12 +80,11 @@ def _section(heading: str, *parts: str) -> str:
     return f"<section><h2>{escape(heading)}</h2>{content}</section>" if content else ""
 
 
-def _verdict(report: Report) -> str:
-    failed = [f.name for f in report.findings if not f.ok]
-    said = f"{report.committed} of {report.card['n']} samples are there. "
+def _verdict(report: VerificationReport) -> str:
+    failed, extent = report.failed, f"{report.committed} of {report.card['n']} samples are committed. "
     if failed:
-        return f'<p class="verdict bad"><b>{len(failed)} checks fail</b>: {escape(", ".join(failed))}. {said}</p>'
-    return f'<p class="verdict"><b>Every check passes.</b> {said}</p>'
+        return f'<p class="verdict bad"><b>{len(failed)} checks fail</b>: {escape(", ".join(failed))}. {extent}</p>'
+    return f'<p class="verdict"><b>Every check passes.</b> {extent}</p>'
 
 
 def _checks_table(findings: Sequence[Finding]) -> str:
@@ -98,10 +95,10 @@ def _checks_table(findings: Sequence[Finding]) -> str:
         first = "" if f.ok else f" <b>Not in {', '.join(map(str, f.first))}.</b> {escape(f.note)}"
         rows.append(
             f'<tr><th scope="row">{escape(f.name)}</th>{mark}<td class="words">{escape(f.what)}{first}</td>'
-            f'<td class="number">{f.covered} {f.of}</td><td class="number">{worst}</td>'
+            f'<td class="number">{f.covered} {f.items}</td><td class="number">{worst}</td>'
             f'<td>{escape(f.tolerance)}</td><td class="words soft">{escape(f.why)}</td></tr>'
         )
-    heads = ("check", "result", "what holds", "looked at", "worst", "tolerance", "because")
+    heads = ("check", "result", "checked property", "items", "worst", "tolerance", "reason")
     head = "".join(f'<th scope="col">{name}</th>' for name in heads)
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="Checks"><table><thead><tr>'
@@ -109,20 +106,20 @@ def _checks_table(findings: Sequence[Finding]) -> str:
     )
 
 
-def _checks_notes(report: Report) -> str:
-    if not report.drawn:
-        return '<p class="soft">No sample was drawn again (--samples 0).</p>'
+def _checks_notes(report: VerificationReport) -> str:
+    if not report.rerendered:
+        return '<p class="soft">No sample was re-rendered (--samples 0).</p>'
     return (
-        f'<p class="soft">Every sample that is there was read. {report.drawn} of {report.committed}, chosen at '
-        f"random, were also drawn again, with {escape(report.gl or 'no GL')}.</p>"
+        f'<p class="soft">Every committed sample was read. {report.rerendered} of {report.committed}, chosen at '
+        f"random, were also re-rendered with {escape(report.gl or 'no GL')}.</p>"
     )
 
 
-def _coverage(report: Report) -> str:
+def _coverage(report: VerificationReport) -> str:
     coverage = report.coverage
     if not coverage:
         return ""
-    scenes = scenes_of(coverage)
+    scenes = by_scene(coverage)
     rings = int(np.clip(np.sqrt(len(scenes["scene"]) / (6 * _PER_CELL)), 1, 12))
     ranges = _ranges(report)
     by_diameter = "distance_diameters" in ranges
@@ -130,8 +127,8 @@ def _coverage(report: Report) -> str:
     counts = {str(i): int((coverage["obj_id"] == i).sum()) for i in sorted(report.facts.meshes)}
     figures = [
         plots.sphere_maps(*view_counts(scenes["view"], rings), rings),
-        plots.place_map(coverage["u"], coverage["v"], report.facts.camera.width_px, report.facts.camera.height_px),
-        plots.histogram("Turn in the image plane, by scene", "degrees", scenes["roll_deg"], -180, 180),
+        plots.position_map(coverage["u"], coverage["v"], report.facts.camera.width_px, report.facts.camera.height_px),
+        plots.histogram("In-plane rotation, by scene", "degrees", scenes["roll_deg"], -180, 180),
         plots.histogram(
             "Distance, by scene",
             "diameters" if by_diameter else "metres",
@@ -140,53 +137,56 @@ def _coverage(report: Report) -> str:
         ),
         plots.histogram("Perturbation, angle", "degrees", coverage["angle_deg"], *ranges["angle_deg"]),
         plots.histogram(
-            "Perturbation, translation", "diameters", coverage["moved_diameters"], *ranges["moved_diameters"]
+            "Perturbation, translation",
+            "diameters",
+            coverage["translation_diameters"],
+            *ranges["translation_diameters"],
         ),
-        plots.histogram("Visible fraction", "share of the silhouette", coverage["visible_fraction"], 0, 1),
+        plots.histogram("Visible fraction", "fraction of the silhouette", coverage["visible_fraction"], 0, 1),
         plots.bars("Samples by object", "object id", counts),
         _rejected(coverage["rejected"]),
     ]
     return f'<div class="plots">{"".join(figures)}</div>'
 
 
-def _ranges(report: Report) -> dict[str, tuple[float, float]]:
-    """Ends of the histograms by what they show: the recipe's, or the data's where pairs were cut out of images."""
+def _ranges(report: VerificationReport) -> dict[str, tuple[float, float]]:
+    """Axis limits of the histograms by name: the recipe's bounds, or the data's for pairs cut from images."""
     if not report.facts.rendered:
-        names = ("distance_m", "angle_deg", "moved_diameters")
+        names = ("distance_m", "angle_deg", "translation_diameters")
         return {name: (0.0, max(1e-3, 1.0001 * float(report.coverage[name].max()))) for name in names}
     distance, perturbation = (report.card["config"][key] for key in ("distance", "perturbation"))
     name = "distance_diameters" if distance["unit"] == "diameter" else "distance_m"
     return {
         name: (distance["min"], distance["max"]),
         "angle_deg": (0.0, perturbation["max_angle_deg"] * 1.0001),
-        "moved_diameters": (0.0, perturbation["max_translation_diameter"] * 1.0001),
+        "translation_diameters": (0.0, perturbation["max_translation_diameter"] * 1.0001),
     }
 
 
-def _rejected(draws: Array) -> str:
+def _rejected(draws: np.ndarray) -> str:
     title, label = "Rejected draws before a sample", "draws"
     if int(draws.max()) < 24:
         return plots.bars(title, label, {str(i): int((draws == i).sum()) for i in range(int(draws.max()) + 1)})
     return plots.histogram(title, label, draws.astype(np.float64), 0, float(draws.max()))
 
 
-def _random_samples(report: Report) -> list[int]:
-    there = ShardReader(report.url).committed
+def _random_samples(report: VerificationReport) -> list[int]:
+    shard_ids = ShardReader(report.url).committed
     size, n = int(report.card["shard_size"]), int(report.card["n"])
     rng = np.random.default_rng(0)
-    return sorted({min(int(rng.choice(there)) * size + int(rng.integers(size)), n - 1) for _ in range(SHOWN)})
+    return sorted({min(int(rng.choice(shard_ids)) * size + int(rng.integers(size)), n - 1) for _ in range(SHOWN)})
 
 
-def _sheet(report: Report, indices: Sequence[int], alt: str) -> str:
+def _sheet(report: VerificationReport, indices: Sequence[int], alt: str) -> str:
     reader = ShardReader(report.url)
     rows: list[Image] = []
     for index in indices:
-        shard_id, place = divmod(index, reader.shard_size)
+        shard_id, row = divmod(index, reader.shard_size)
         try:
             values = reader.read(shard_id)
-        except (ShardError, StorageError):  # damaged, which its own check says
+        except (ShardError, StorageError):  # a damaged shard, which the check of checksums reports
             continue
-        rows.append(sample_row({name: value[place] for name, value in values.items()}, index))
+        rows.append(sample_row({name: value[row] for name, value in values.items()}, index))
     if not rows:
         return ""
     ok, data = cv2.imencode(".jpg", np.concatenate([title_row(), *rows])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])
@@ -198,7 +198,7 @@ def _sheet(report: Report, indices: Sequence[int], alt: str) -> str:
     )
 
 
-def _card(report: Report) -> str:
+def _card(report: VerificationReport) -> str:
     card = report.card
     camera = card["camera"]
     entries = {
@@ -215,8 +215,8 @@ def _card(report: Report) -> str:
     return f"<dl>{items}</dl>"
 
 
-def _origin(report: Report) -> dict[str, str]:
-    """What made the scenes."""
+def _origin(report: VerificationReport) -> dict[str, str]:
+    """Entry of the engines, or of the images that pairs were cut from."""
     card = report.card
     if report.facts.rendered:
         return {"engine": f"{card['config']['engine']}, hypotheses {card['config']['hypothesis_engine']}"}

@@ -1,4 +1,4 @@
-"""Histograms and maps as inline SVG: they scale with the page and need no other file."""
+"""Histograms and maps of coverage as inline SVG, scalable and without other files."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -9,8 +9,6 @@ from jaxtyping import Float, Int
 
 from synthgen.verify.coverage import sectors_in
 
-Array = np.ndarray
-
 WIDTH, HEIGHT = 460, 250
 LEFT, RIGHT, TOP, BOTTOM = 52, 14, 12, 46
 BAR = "#1f5fd0"
@@ -18,8 +16,10 @@ EMPTY = "#d9730d"
 _LOW, _HIGH = np.array([226.0, 236.0, 250.0]), np.array([12.0, 52.0, 130.0])  # few to many samples
 
 
-def histogram(title: str, x_label: str, values: Float[Array, " n"], low: float, high: float, bins: int = 24) -> str:
-    """Shares of samples by value; what lies outside of [low, high] is said below the axis' label."""
+def histogram(
+    title: str, x_label: str, values: Float[np.ndarray, " n"], low: float, high: float, bins: int = 24
+) -> str:
+    """Fractions of samples by value; the axis' label counts values outside [low, high]."""
     high = high if high > low else low + 1.0
     finite = values[np.isfinite(values)]
     counts, edges = np.histogram(finite, bins=bins, range=(low, high))
@@ -31,7 +31,7 @@ def histogram(title: str, x_label: str, values: Float[Array, " n"], low: float, 
 
 
 def bars(title: str, x_label: str, counts: Mapping[str, int]) -> str:
-    """Samples by name; with many names only some are written below."""
+    """Samples by name; with many names only some are labelled."""
     names = list(counts)
     every = max(1, -(-len(names) // 12))
     ticks = [((i + 0.5) / len(names), name) for i, name in enumerate(names) if i % every == 0]
@@ -39,44 +39,44 @@ def bars(title: str, x_label: str, counts: Mapping[str, int]) -> str:
 
 
 def _figure(
-    title: str, x_label: str, counts: Int[Array, " b"], names: Sequence[str], ticks: Sequence[tuple[float, str]]
+    title: str, x_label: str, counts: Int[np.ndarray, " b"], names: Sequence[str], ticks: Sequence[tuple[float, str]]
 ) -> str:
     total, top = max(1, int(counts.sum())), max(1, int(counts.max(initial=0)))
     across, down = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
     width = across / max(1, len(counts))
     parts = []
-    for share in _ticks(0.0, top / total, 4):
-        y = TOP + down * (1 - share * total / top)
+    for fraction in _ticks(0.0, top / total, 4):
+        y = TOP + down * (1 - fraction * total / top)
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
-        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * share:.3g}%</text>')
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * fraction:.3g}%</text>')
     for i, count in enumerate(counts.tolist()):
         height = down * count / top
         parts.append(
             f'<rect x="{LEFT + i * width:.1f}" y="{TOP + down - height:.1f}" width="{max(width - 1, 0.5):.1f}" '
             f'height="{height:.1f}" fill="{BAR}"><title>{escape(names[i])}: {count} samples</title></rect>'
         )
-    for place, text in ticks:
+    for position, text in ticks:
         parts.append(
-            f'<text x="{LEFT + place * across:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
+            f'<text x="{LEFT + position * across:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
             f"{escape(text)}</text>"
         )
     parts.append(f'<path class="axis" d="M{LEFT} {TOP + down}H{WIDTH - RIGHT}"/>')
     parts.append(f'<text x="{LEFT + across / 2:.0f}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x_label)}</text>')
     full = [name for name, count in zip(names, counts.tolist(), strict=True) if count]
-    said = f"{title}: {total} samples, from {full[0]} to {full[-1]}" if full else f"{title}: no samples"
+    label = f"{title}: {total} samples, from {full[0]} to {full[-1]}" if full else f"{title}: no samples"
     return (
         f'<figure><figcaption>{escape(title)}</figcaption><svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
-        f'aria-label="{escape(said)}">{"".join(parts)}</svg></figure>'
+        f'aria-label="{escape(label)}">{"".join(parts)}</svg></figure>'
     )
 
 
-def sphere_maps(upper: Int[Array, " c"], lower: Int[Array, " c"], rings: int) -> str:
-    """Camera directions in the object's frame: both hemispheres, equal areas, a colour for the number of scenes.
+def sphere_maps(upper: Int[np.ndarray, " c"], lower: Int[np.ndarray, " c"], rings: int) -> str:
+    """Camera directions in the object's frame: both hemispheres on equal-area maps, coloured by the number of scenes.
 
     Args:
         upper: Scenes by cell, as `coverage.view_counts` gives them.
         lower: The same from below.
-        rings: Of each map.
+        rings: Number of rings of each map.
     """
     total, most = int(upper.sum() + lower.sum()), int(max(upper.max(), lower.max(), 1))
     radius, pad, top = 95, 26, 28
@@ -96,17 +96,18 @@ def sphere_maps(upper: Int[Array, " c"], lower: Int[Array, " c"], rings: int) ->
         parts.append(f'<text x="{middle_x + radius + 4}" y="{middle_y + 4}">+x</text>')
         parts.append(f'<text x="{middle_x}" y="{top + 2 * radius + 15}" text-anchor="middle">-y</text>')
     number, holes = len(upper) + len(lower), int((upper == 0).sum() + (lower == 0).sum())
-    said = f"{total} scenes in {number} cells of equal area, {holes} of them empty, at most {most} in one"
+    summary = f"{total} scenes in {number} cells of equal area, {holes} cells empty, at most {most} scenes a cell"
     return (
         '<figure class="wide"><figcaption>Camera direction, object frame</figcaption>'
-        f'<svg viewBox="0 0 {4 * (radius + pad)} {2 * radius + 48}" role="img" aria-label="Camera direction: {said}">'
-        f'{"".join(parts)}</svg><p class="soft">{said}. {_key(most)} A disc shows a hemisphere around its pole, the '
+        f'<svg viewBox="0 0 {4 * (radius + pad)} {2 * radius + 48}" role="img" '
+        f'aria-label="Camera direction: {summary}">'
+        f'{"".join(parts)}</svg><p class="soft">{summary}. {_key(most)} A disc shows a hemisphere around its pole, the '
         "rim is the object's xy plane.</p></figure>"
     )
 
 
 def _cell(ring: int, sector: int, width: float) -> str:
-    """Outline of a cell around the origin, y upwards turned into the drawing's y downwards."""
+    """Outline of a cell around the origin, with y flipped from upwards to SVG's downwards."""
     inner, outer, count = ring * width, (ring + 1) * width, sectors_in(ring)
     a, b = 2 * np.pi * sector / count, 2 * np.pi * (sector + 1) / count
 
@@ -117,8 +118,10 @@ def _cell(ring: int, sector: int, width: float) -> str:
     return start + (f"A{inner:.2f} {inner:.2f} 0 0 1 {point(inner, a)}Z" if inner else "Z")
 
 
-def place_map(u: Float[Array, " n"], v: Float[Array, " n"], width_px: int, height_px: int, cells: int = 24) -> str:
-    """Where in the image the windows' centres lie, with a margin for centres outside."""
+def position_map(
+    u: Float[np.ndarray, " n"], v: Float[np.ndarray, " n"], width_px: int, height_px: int, cells: int = 24
+) -> str:
+    """Positions of the window centres in the image, with a margin for centres outside."""
     edges = np.linspace(-0.25, 1.25, cells + 1).tolist()
     finite = np.isfinite(u) & np.isfinite(v)
     counts = np.histogram2d(v[finite], u[finite], bins=[edges, edges])[0].astype(int)
@@ -136,10 +139,10 @@ def place_map(u: Float[Array, " n"], v: Float[Array, " n"], width_px: int, heigh
         f'<rect class="ring" x="{across / 6:.1f}" y="{down / 6:.1f}" width="{across / 1.5:.1f}" '
         f'height="{down / 1.5:.1f}"/>'
     )
-    said = f"Window centres in the image of {width_px} x {height_px} px: {int(finite.sum())} samples"
+    label = f"Window centres in the image of {width_px} x {height_px} px: {int(finite.sum())} samples"
     return (
         "<figure><figcaption>Window centre in the image</figcaption>"
-        f'<svg viewBox="0 0 {across:.0f} {down:.0f}" role="img" aria-label="{said}">{"".join(parts)}</svg>'
+        f'<svg viewBox="0 0 {across:.0f} {down:.0f}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
         f'<p class="soft">The frame is the image, {width_px} x {height_px} px.</p></figure>'
     )
 
@@ -157,7 +160,7 @@ def _key(most: int) -> str:
 
 
 def _ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """Round numbers from `low` to `high`, about `count` of them."""
+    """About `count` round numbers from `low` to `high`."""
     raw = max(high - low, 1e-12) / count
     power = 10.0 ** np.floor(np.log10(raw))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)

@@ -14,44 +14,43 @@ from posecore.shard import ShardReader, n_shards
 from posecore.shard.layout import metadata
 
 from synthgen.pairs.pair_maker import limit_threads
-from synthgen.verify.checks import CHECKS, Check
-from synthgen.verify.coverage import Coverage, coverage_of, joined
-from synthgen.verify.facts import Batch, Facts, load_facts, manifest_lines
-from synthgen.verify.findings import FIRST, Finding, Report, dataset_finding, tolerance_text
-
-Array = np.ndarray
+from synthgen.verify.check import Check
+from synthgen.verify.checks import CHECKS
+from synthgen.verify.coverage import Coverage, joined, measure_coverage
+from synthgen.verify.facts import Facts, SampleBatch, load_facts
+from synthgen.verify.findings import FIRST, Finding, VerificationReport, dataset_finding, tolerance_text
 
 DEFAULT_SAMPLES = 5000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ShardResult:
-    """What a shard's checks measured: measure and sample indices by check, or why it could not be read."""
+    """Measures of a shard: measure and sample indices by check, or the damage that prevents reading."""
 
     shard_id: int
     n: int
     damage: str | None = None
     line_is_right: bool = True
-    measured: dict[str, tuple[Array, Array]] = field(default_factory=dict)
+    measured: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     hashes: tuple[bytes, ...] = ()
     coverage: Coverage = field(default_factory=dict)
     gl: str | None = None
 
 
 class ShardVerifier:
-    """Verifies shards of one dataset, in the thread that made it."""
+    """Verifies shards of a dataset, in the thread that made the verifier."""
 
     def __init__(self, url: str) -> None:
         self.reader = ShardReader(url)
         self.facts = load_facts(self.reader)
-        self._lines = manifest_lines(self.reader)
+        self._lines = self.reader.manifest_lines
         self._rasteriser: Rasteriser | None = None
 
-    def verify(self, shard_id: int, drawn: Sequence[int]) -> ShardResult:
-        """Measure every check; the costly ones on the samples at the places `drawn` of the shard.
+    def verify(self, shard_id: int, rerendered: Sequence[int]) -> ShardResult:
+        """Measure every check; the costly checks only on the samples at the positions `rerendered` of the shard.
 
         Raises:
-            RenderError: Samples are to be drawn again and there is no EGL device.
+            RenderError: Samples are to be rendered and there is no EGL device.
         """
         count = self.reader.n_samples(shard_id)
         try:
@@ -59,15 +58,15 @@ class ShardVerifier:
         except (ShardError, StorageError) as error:
             return ShardResult(shard_id=shard_id, n=count, damage=str(error))
         indices = shard_id * self.reader.shard_size + np.arange(count)
-        batch = Batch(values, indices, self.facts)
-        checks = checks_of(self.facts)
-        measured = {c.name: (c.measure(batch), indices) for c in checks if not c.drawn}
-        if len(drawn):
+        batch = SampleBatch(values, indices, self.facts)
+        checks = applicable_checks(self.facts)
+        measured = {c.name: (c.measure(batch), indices) for c in checks if not c.rerendered}
+        if len(rerendered):
             if self._rasteriser is None:
                 self._rasteriser = Rasteriser(self.facts.meshes)
-            places = np.asarray(drawn)
-            part = Batch({k: v[places] for k, v in values.items()}, indices[places], self.facts, self._rasteriser)
-            measured |= {c.name: (c.measure(part), part.indices) for c in checks if c.drawn}
+            rows = np.asarray(rerendered)
+            part = SampleBatch({k: v[rows] for k, v in values.items()}, indices[rows], self.facts, self._rasteriser)
+            measured |= {c.name: (c.measure(part), part.indices) for c in checks if c.rerendered}
         line = self._lines[shard_id]
         return ShardResult(
             shard_id=shard_id,
@@ -75,7 +74,7 @@ class ShardVerifier:
             line_is_right=line.get("n") == count and line.get("rejected") == int(values["rejected"].sum()),
             measured=measured,
             hashes=tuple(_hash(values, i) for i in range(count)),
-            coverage=coverage_of(batch),
+            coverage=measure_coverage(batch),
             gl=self._rasteriser.device if self._rasteriser else None,
         )
 
@@ -94,16 +93,16 @@ def verify(
     allow_incomplete: bool = False,
     workers: int = 1,
     on_shard: Callable[[int], None] = lambda n: None,
-) -> Report:
+) -> VerificationReport:
     """Verify a dataset, complete or growing.
 
-    Every shard is read whole. What it costs milliseconds to check is checked on some samples, drawn at random from all
-    that are there; the report says on how many.
+    Every shard is read whole. Checks that cost milliseconds a sample are limited to a random choice of samples, whose
+    number is in the report.
 
     Args:
         url: Folder or fsspec URL.
-        samples: How many to draw again; all when there are not more.
-        seed: Decides which.
+        samples: Number of samples to re-render; all when there are fewer.
+        seed: Seed of their choice.
         allow_incomplete: Whether missing shards are no failure.
         workers: Processes. The report does not depend on it.
         on_shard: Called with each shard's number of samples.
@@ -118,20 +117,20 @@ def verify(
     ids = reader.committed
     if not ids:
         raise ShardError(f"{url}: no shard is rendered yet, so there is nothing to verify")
-    drawn = _drawn(reader, samples, seed)
+    rerendered = _choose_samples(reader, samples, seed)
     results = []
-    with _mapped(verifier, workers, [(i, drawn.get(i, ())) for i in ids]) as found:
-        for result in found:
+    with _mapped(verifier, workers, [(i, rerendered.get(i, ())) for i in ids]) as shard_results:
+        for result in shard_results:
             results.append(result)
             on_shard(result.n)
     findings = [_complete(reader, allow_incomplete), _arrays(reader), _objects(facts)]
     findings += [*_shards(results), *_samples(results, facts), _duplicates(results, reader.shard_size)]
-    return Report(
+    return VerificationReport(
         url=url,
-        card=dict(reader.card),
+        card=dict(facts.card),
         digest=reader.digest,
         committed=sum(map(reader.n_samples, ids)),
-        drawn=sum(map(len, drawn.values())),
+        rerendered=sum(map(len, rerendered.values())),
         gl=next((r.gl for r in results if r.gl), None),
         findings=tuple(findings),
         coverage=joined([r.coverage for r in results if r.coverage]),
@@ -139,15 +138,15 @@ def verify(
     )
 
 
-def _drawn(reader: ShardReader, samples: int, seed: int) -> dict[int, list[int]]:
-    """Places of the samples to draw again, by shard."""
-    there = np.concatenate([i * reader.shard_size + np.arange(reader.n_samples(i)) for i in reader.committed])
-    if samples < len(there):
-        there = np.sort(np.random.default_rng(seed).choice(there, samples, replace=False))
-    places: dict[int, list[int]] = {}
-    for index in there.tolist():
-        places.setdefault(index // reader.shard_size, []).append(index % reader.shard_size)
-    return places
+def _choose_samples(reader: ShardReader, samples: int, seed: int) -> dict[int, list[int]]:
+    """Positions in their shards of the samples to re-render, by shard."""
+    indices = np.concatenate([i * reader.shard_size + np.arange(reader.n_samples(i)) for i in reader.committed])
+    if samples < len(indices):
+        indices = np.sort(np.random.default_rng(seed).choice(indices, samples, replace=False))
+    positions: dict[int, list[int]] = {}
+    for index in indices.tolist():
+        positions.setdefault(index // reader.shard_size, []).append(index % reader.shard_size)
+    return positions
 
 
 _worker: list[ShardVerifier] = []
@@ -175,7 +174,7 @@ def _mapped(
         finally:
             verifier.close()
         return
-    died = f"{url}: a worker process died while it verified; start again with fewer --workers"
+    died = f"{url}: a worker process died during verification; start again with fewer --workers"
     with spawned(workers, _start_worker, (url,), died) as pool:
         yield pool.map(_in_worker, tasks)
 
@@ -219,14 +218,14 @@ def _shards(results: Sequence[ShardResult]) -> list[Finding]:
     ]
 
 
-def checks_of(facts: Facts) -> list[Check]:
-    """The checks that say something of this dataset."""
+def applicable_checks(facts: Facts) -> list[Check]:
+    """The checks that apply to this kind of dataset."""
     return [check for check in CHECKS if facts.rendered or not check.rendered]
 
 
 def _samples(results: Sequence[ShardResult], facts: Facts) -> list[Finding]:
     findings = []
-    for check in checks_of(facts):
+    for check in applicable_checks(facts):
         parts = [r.measured[check.name] for r in results if check.name in r.measured]
         measure = np.concatenate([m for m, _ in parts]) if parts else np.zeros(0)
         indices = np.concatenate([i for _, i in parts]) if parts else np.zeros(0, np.int64)
@@ -253,14 +252,14 @@ def _duplicates(results: Sequence[ShardResult], shard_size: int) -> Finding:
     seen: set[bytes] = set()
     twice = []
     for result in results:
-        for place, digest in enumerate(result.hashes):
+        for row, digest in enumerate(result.hashes):
             if digest in seen:
-                twice.append(result.shard_id * shard_size + place)
+                twice.append(result.shard_id * shard_size + row)
             seen.add(digest)
     return dataset_finding("duplicates", "samples", sum(len(r.hashes) for r in results), twice)
 
 
-def _hash(values: dict[str, Array], i: int) -> bytes:
+def _hash(values: dict[str, np.ndarray], i: int) -> bytes:
     digest = hashlib.blake2b(digest_size=16)
     for name in ("T_cam_obj", "T_cam_obj_hypothesis", "scene_rgb"):
         digest.update(values[name][i].tobytes())

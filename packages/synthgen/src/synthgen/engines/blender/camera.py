@@ -13,13 +13,13 @@ NEAREST_M = 0.01
 
 Region = tuple[int, int, int, int]
 
-# The camera frame is the world frame, and Blender's camera at the origin looks along -z with y up: x stays, y and z
+# The camera frame is the world frame. Blender's camera at the origin has its view along -z and y up: x stays, y and z
 # change sign. This is the only place where axes are converted.
 _BLENDER_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def blender_from_opencv(T_cam_x: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-    """Return Blender's world matrix of a thing (object or lamp) whose pose in the OpenCV camera frame is given.
+    """Return Blender's world matrix of an object or lamp from its pose in the OpenCV camera frame.
 
     Args:
         T_cam_x: Pose in the OpenCV camera frame, metres.
@@ -50,8 +50,8 @@ class BlenderLens:
     shift_y: float
 
 
-def lens_of(camera: Camera, region_px: Region) -> BlenderLens:
-    """Return the lens that sees exactly the region's pixels, which may lie outside the image.
+def lens_for(camera: Camera, region_px: Region) -> BlenderLens:
+    """Return the lens whose image is exactly the region, which may extend beyond the camera's image.
 
     The principal point is in the project's continuous pixel coordinates; Blender's viewplane runs from edge to edge
     of the pixels as well, so no half pixel is added anywhere.
@@ -78,15 +78,15 @@ def lens_of(camera: Camera, region_px: Region) -> BlenderLens:
 
 
 def occupied_region(camera: Camera, region_px: Region, corners_cam_m: Float[np.ndarray, "n 8 3"]) -> Region | None:
-    """Return the part of the region that objects can reach, or None where they reach none of it.
+    """Return the part of the region that objects can cover, or None without such a part.
 
     An empty pixel is a third of the work of a full one, and crops around small or distant objects are mostly empty.
 
     Args:
         camera: Pinhole camera.
         region_px: x0, y0, width, height.
-        corners_cam_m: Corners of each object's bounding box. One that stands behind the camera or in it makes no bound,
-            so then the region itself is returned.
+        corners_cam_m: Corners of each object's bounding box. A box behind the camera or around it gives no bound:
+            then the region itself is returned.
     """
     corners = corners_cam_m.reshape(-1, 3)
     if (corners[:, 2] < NEAREST_M).any():

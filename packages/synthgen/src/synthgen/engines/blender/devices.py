@@ -1,4 +1,4 @@
-"""The GPUs that Cycles finds. As a program it writes their numbers as JSON: see `synthgen.engines.devices`."""
+"""GPUs available to Cycles. As a program it writes their numbers as JSON: see `synthgen.engines.devices`."""
 
 import json
 import sys
@@ -6,30 +6,30 @@ from typing import Any
 
 import bpy
 
-from synthgen.engine import GPU_DEVICES, Device
 from synthgen.engines.blender.quiet import blender_output_caught
+from synthgen.names import GPU_DEVICES, Device
 
 
 def gpu_counts() -> dict[Device, int]:
     """Number of GPUs by kind, kinds without any left out."""
-    counts: dict[Device, int] = {kind: len(_found(kind)) for kind in GPU_DEVICES}
+    counts: dict[Device, int] = {kind: len(_devices(kind)) for kind in GPU_DEVICES}
     return {kind: count for kind, count in counts.items() if count}
 
 
 def use_gpus(kind: Device) -> None:
-    """Have Cycles trace on every GPU of a kind that this process sees (CUDA_VISIBLE_DEVICES), and on nothing else."""
+    """Make Cycles use exactly the GPUs of a kind that are visible to this process (CUDA_VISIBLE_DEVICES)."""
     preferences = _preferences()
     preferences.compute_device_type = kind.upper()
-    mine = _found(kind)
+    chosen = _devices(kind)
     for device in preferences.devices:
-        device.use = device in mine
+        device.use = device in chosen
 
 
-def _found(kind: Device) -> list[Any]:
+def _devices(kind: Device) -> list[Any]:
     name = kind.upper()
     try:
         return [device for device in _preferences().get_devices_for_type(name) if device.type == name]
-    except (TypeError, ValueError):  # a kind that this build of Blender does not know
+    except (TypeError, ValueError):  # a kind that this build of Blender does not support
         return []
 
 
@@ -39,5 +39,5 @@ def _preferences() -> Any:
 
 if __name__ == "__main__":
     with blender_output_caught("looking for GPUs"):
-        found = gpu_counts()
-    sys.stdout.write(json.dumps(found) + "\n")
+        counts_by_kind = gpu_counts()
+    sys.stdout.write(json.dumps(counts_by_kind) + "\n")

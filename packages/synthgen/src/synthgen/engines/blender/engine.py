@@ -17,9 +17,9 @@ except ImportError as error:
         "it names, or use the engine raster"
     ) from error
 
-from synthgen.engine import Device, RenderedScene
+from synthgen.engine import RenderedScene
 from synthgen.engines.blender import scratch
-from synthgen.engines.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_of, occupied_region
+from synthgen.engines.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_for, occupied_region
 from synthgen.engines.blender.exr import read_channels
 from synthgen.engines.blender.lights import Lamps, World
 from synthgen.engines.blender.materials import INDEX_AOV
@@ -27,6 +27,7 @@ from synthgen.engines.blender.objects import Props
 from synthgen.engines.blender.quiet import blender_output_caught
 from synthgen.engines.blender.settings import ENGINE_IDS, set_common, set_cycles, set_eevee
 from synthgen.image.hdri import with_lamps, with_suns
+from synthgen.names import Device
 from synthgen.scene import Scene
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
@@ -40,12 +41,12 @@ class BlenderEngine:
 
     Depth and index are sampled once, at the pixels' centres: by Cycles with the first of its samples, by EEVEE in a
     render of their own, since its samples all count for every layer. Surfaces nearer than 1 cm or farther than 100 m
-    are not seen. Several engines may live in one process; a process that has one must not fork.
+    are clipped. Several engines may live in one process; a process that has one must not fork.
 
     Args:
         name: 'cycles' or 'eevee'.
         threads: Threads to render with, 0 for all cores. The result is the same for any number.
-        device: Where Cycles traces; 'auto' takes OptiX, CUDA or the CPU, whichever is there first.
+        device: Device of Cycles; 'auto' takes the first available one of OptiX, CUDA and the CPU.
 
     Raises:
         ConfigError: Another name.
@@ -78,7 +79,7 @@ class BlenderEngine:
         self._scene.render.filepath = str(self._file)
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make the meshes known under their keys; a key that is known already is replaced.
+        """Load meshes under their keys; a mesh with a loaded key replaces the earlier mesh.
 
         Raises:
             MeshError: A mesh has no faces, or its faces do not fit its vertices.
@@ -89,7 +90,7 @@ class BlenderEngine:
         """Render `scene.region_px`.
 
         Raises:
-            RenderError: A mesh key is unknown or Blender failed.
+            RenderError: A mesh key is not loaded, or Blender failed.
         """
         # EEVEE's light from a world casts no shadow.
         scene = with_suns(scene) if self.name == "cycles" else with_lamps(scene)
@@ -127,14 +128,14 @@ class BlenderEngine:
         bpy.data.scenes.remove(self._scene)
 
     def _point_camera(self, camera: Camera, region_px: Region) -> None:
-        lens = lens_of(camera, region_px)
+        lens = lens_for(camera, region_px)
         render, settings = self._scene.render, self._camera.data
         render.resolution_x, render.resolution_y = lens.width_px, lens.height_px
         render.pixel_aspect_x, render.pixel_aspect_y = lens.pixel_aspect_x, lens.pixel_aspect_y
         settings.lens, settings.shift_x, settings.shift_y = lens.lens_mm, lens.shift_x, lens.shift_y
 
     def _render(self) -> Channels:
-        # Without the old file a render that writes nothing cannot pass off the last one's layers as its own.
+        # Without the old file, a render that writes nothing cannot return the layers of the previous one.
         self._file.unlink(missing_ok=True)
         with blender_output_caught(f"{self.name}: Blender failed to render"):
             bpy.ops.render.render(scene=self._scene.name, write_still=True)
@@ -166,8 +167,8 @@ def _paste(
         colour: The Combined pass: premultiplied by alpha.
         depth: Camera z; anything where nothing was hit.
         number: Object index + 1; 0 where nothing was hit.
-        region_px: What the layers show.
-        occupied_px: What the channels show, inside the region; Blender's smallest picture may be larger.
+        region_px: Region of the layers.
+        occupied_px: Region of the channels, inside `region_px`; Blender's smallest picture may be larger.
     """
     x0, y0, width, height = occupied_px
     left, top = x0 - region_px[0], y0 - region_px[1]

@@ -1,4 +1,4 @@
-"""Reads the layers that Blender writes."""
+"""Reading of Blender's multilayer EXR files."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Lamps and the world around, even or a panorama, pooled and updated in place."""
+"""Lamps and the world, uniform or a panorama, pooled and updated in place."""
 
 import bpy
 import numpy as np
@@ -9,15 +9,15 @@ from synthgen.engines.blender.camera import blender_from_opencv
 from synthgen.image import hdri
 from synthgen.scene import Environment, Light
 
-PANORAMAS = 8  # worlds kept at a time; one is 8 MB
+PANORAMAS = 8  # cached worlds of 8 MB each
 _BLENDER_KIND = {"point": "POINT", "area": "AREA", "sun": "SUN"}
 
 
 class Lamps:
     """Slot i holds the scene's light i, whatever its kind.
 
-    Slots keep their order, so that Cycles meets the lights in the scene's order and not in the order of the history:
-    its random choice of a light, and with it the noise, depends on that.
+    Slots keep their order, so that Cycles has the lights in the scene's order and not in that of earlier scenes: its
+    random choice of lights, and so the noise, depends on the order.
     """
 
     def __init__(self, collection: bpy.types.Collection) -> None:
@@ -55,7 +55,7 @@ class Lamps:
 
 
 class World:
-    """What surrounds the scene: one colour, or a panorama beside it. It lights and is not seen: the film is clear."""
+    """Environment of the scene: a uniform colour, or a panorama plus a colour. It is a light source but invisible."""
 
     def __init__(self, scene: bpy.types.Scene) -> None:
         self._scene = scene
@@ -92,7 +92,7 @@ class World:
         return world
 
     def _panorama(self, path: str) -> "_Panorama":
-        """The panorama of a file; the one unused for longest makes room for a new one."""
+        """Panorama of a file; a new one replaces the least recently used."""
         panorama = self._panoramas.pop(path, None) or _Panorama(path)
         self._panoramas[path] = panorama
         if len(self._panoramas) > PANORAMAS:
@@ -101,11 +101,11 @@ class World:
 
 
 class _Panorama:
-    """A world lit by one panorama: its image, seen through a turn, times its strength, plus an even colour.
+    """World of a panorama: its rotated image times its strength, plus a uniform colour.
 
-    The bright places are lamps (`hdri.with_suns`). Sampling the panorama by importance is the obvious way, but Cycles
-    takes the sampling method of the first world that it renders for all later ones, so a picture would depend on
-    what was rendered before it, and it builds its map again at every turn.
+    The bright spots are lamps (`hdri.with_suns`). Importance sampling of the panorama would be obvious, but Cycles
+    applies the sampling method of the first rendered world to all later ones, so that a picture would depend on
+    earlier renders, and it rebuilds its map at every rotation.
     """
 
     def __init__(self, path: str) -> None:
@@ -121,20 +121,20 @@ class _Panorama:
         self.world.use_nodes = True
         self.world.cycles.sampling_method = "NONE"
         tree = self.world.node_tree
-        direction, self._turn = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
-        tree.links.new(direction.outputs["Generated"], self._turn.inputs["Vector"])
+        direction, self._rotation = tree.nodes.new("ShaderNodeTexCoord"), tree.nodes.new("ShaderNodeMapping")
+        tree.links.new(direction.outputs["Generated"], self._rotation.inputs["Vector"])
         texture = tree.nodes.new("ShaderNodeTexEnvironment")
         texture.image = self.image
-        tree.links.new(self._turn.outputs["Vector"], texture.inputs["Vector"])
+        tree.links.new(self._rotation.outputs["Vector"], texture.inputs["Vector"])
         self._scale = tree.nodes.new("ShaderNodeVectorMath")
         self._scale.operation = "MULTIPLY_ADD"
         tree.links.new(texture.outputs["Color"], self._scale.inputs[0])
         tree.links.new(self._scale.outputs["Vector"], tree.nodes["Background"].inputs["Color"])
 
     def set(self, rgb: tuple[float, float, float], environment: Environment) -> None:
-        """Set turn, strength and even light."""
+        """Set rotation, strength and uniform light."""
         R_env_world = environment.R_cam_env.T @ blender_from_opencv(np.eye(4))[:3, :3]
-        self._turn.inputs["Rotation"].default_value = Matrix(R_env_world.tolist()).to_euler("XYZ")
+        self._rotation.inputs["Rotation"].default_value = Matrix(R_env_world.tolist()).to_euler("XYZ")
         self._scale.inputs[1].default_value = (environment.strength,) * 3
         self._scale.inputs[2].default_value = rgb
 
@@ -161,10 +161,10 @@ def _set_block(block: bpy.types.Light, light: Light) -> None:
 
 
 def _lamp_pose(light: Light) -> Float[np.ndarray, "4 4"]:
-    """Return the lamp's pose in the OpenCV camera frame: its own z axis points back along the light it sends.
+    """Return the lamp's pose in the OpenCV camera frame: its z axis is opposite to its light.
 
-    A Blender lamp shines along its -z, so z is the direction from the scene towards the lamp. The turn about z is
-    free, and fixed by the axis that z is least aligned with.
+    A Blender lamp shines along its -z, so z is the direction from the scene towards the lamp. The rotation about z
+    is free, and fixed by the axis that z is least aligned with.
     """
     z = np.array(light.direction_cam) / np.linalg.norm(light.direction_cam)
     x = np.cross(np.eye(3)[np.argmin(np.abs(z))], z)

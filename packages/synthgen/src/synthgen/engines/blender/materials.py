@@ -1,4 +1,4 @@
-"""One node material per mesh; what differs between its objects is read from the object itself."""
+"""A node material per mesh; it reads the differences between objects from custom properties of the object."""
 
 import bpy
 import numpy as np
@@ -13,12 +13,12 @@ ACCENT, WAVE, WARP, BAND = "accent", "wave", "warp", "band"
 
 
 def make_surface(name: str, texture: bpy.types.Image | None) -> bpy.types.Material:
-    """Make the material of one mesh: own or painted colour -> hue, saturation, value -> Principled BSDF.
+    """Create the material of a mesh: original or painted colour -> hue, saturation, value -> Principled BSDF.
 
-    What is painted is one colour or a pattern of two (`scene.Pattern`).
+    The paint is a single colour or a pattern of two (`scene.Pattern`).
 
-    A material of each object's own would be the obvious way, but Cycles then keeps a copy of the mesh for each object
-    and builds its BVH again at every render.
+    A material per object would be obvious, but Cycles would then keep a copy of the mesh for each object and rebuild
+    its BVH at every render.
 
     Args:
         name: Names the datablock.
@@ -29,7 +29,7 @@ def make_surface(name: str, texture: bpy.types.Image | None) -> bpy.types.Materi
     tree = block.node_tree
     tree.nodes.clear()
     mix = tree.nodes.new("ShaderNodeMixRGB")
-    tree.links.new(_own_colour(tree, texture), mix.inputs["Color1"])
+    tree.links.new(_mesh_colour(tree, texture), mix.inputs["Color1"])
     paint = tree.nodes.new("ShaderNodeMixRGB")
     tree.links.new(_attribute(tree, PAINT).outputs["Color"], paint.inputs["Color1"])
     tree.links.new(_attribute(tree, ACCENT).outputs["Color"], paint.inputs["Color2"])
@@ -51,27 +51,27 @@ def make_surface(name: str, texture: bpy.types.Image | None) -> bpy.types.Materi
     return block
 
 
-def set_look(thing: bpy.types.Object, material: Material) -> None:
-    """Give one object the look of `material`."""
+def set_material(thing: bpy.types.Object, material: Material) -> None:
+    """Set the custom properties of an object to `material`."""
     rgb = (0.0, 0.0, 0.0) if material.base_rgb is None else linear_from_srgb(np.array(material.base_rgb)).tolist()
     pattern = material.pattern or Pattern(accent_rgb=(0.0, 0.0, 0.0), wave=(0.0, 0.0, 0.0))
-    look = {
+    properties = {
         PAINT: tuple(rgb),
         ACCENT: tuple(linear_from_srgb(np.array(pattern.accent_rgb)).tolist()),
         WAVE: pattern.wave,
         WARP: pattern.warp,
-        # bend, steepness, offset; without a pattern the accent's share is 0
+        # bend, steepness, offset; without a pattern the accent's fraction is 0
         BAND: (pattern.bend, pattern.sharpness / 2, 0.5) if material.pattern else (0.0, 0.0, 0.0),
         PAINTED: float(material.base_rgb is not None),
         ADJUST: (0.5 + material.hue_shift, material.saturation, material.value),
         FINISH: (material.roughness, material.metallic, material.specular),
     }
-    for name, value in look.items():
+    for name, value in properties.items():
         thing[name] = value
     thing.update_tag(refresh={"OBJECT"})
 
 
-def _own_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None) -> bpy.types.NodeSocket:
+def _mesh_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None) -> bpy.types.NodeSocket:
     if texture is None:
         vertex = tree.nodes.new("ShaderNodeVertexColor")
         vertex.layer_name = COLOUR_ATTRIBUTE
@@ -85,8 +85,8 @@ def _own_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None) -> bp
 
 
 def _pattern(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
-    """The share of the accent colour: the formula of `pattern.accent_weight`."""
-    place = tree.nodes.new("ShaderNodeTexCoord").outputs["Object"]
+    """Weight of the accent colour, by the formula of `pattern.accent_weight`."""
+    position = tree.nodes.new("ShaderNodeTexCoord").outputs["Object"]
     band = tree.nodes.new("ShaderNodeSeparateXYZ")
     tree.links.new(_attribute(tree, BAND).outputs["Vector"], band.inputs["Vector"])
 
@@ -100,7 +100,7 @@ def _pattern(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
     def phase(name: str) -> bpy.types.NodeSocket:
         node = tree.nodes.new("ShaderNodeVectorMath")
         node.operation = "DOT_PRODUCT"
-        tree.links.new(place, node.inputs[0])
+        tree.links.new(position, node.inputs[0])
         tree.links.new(_attribute(tree, name).outputs["Vector"], node.inputs[1])
         return node.outputs["Value"]
 

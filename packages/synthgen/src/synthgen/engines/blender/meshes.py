@@ -1,4 +1,4 @@
-"""From a posecore mesh to Blender's mesh and image datablocks."""
+"""Conversion of posecore meshes to Blender's mesh and image datablocks."""
 
 import bpy
 import numpy as np

@@ -1,4 +1,4 @@
-"""Meshes that are loaded once, and pooled objects that show them."""
+"""Meshes, loaded once, and pools of objects that show them."""
 
 from collections.abc import Mapping
 from itertools import product
@@ -12,7 +12,7 @@ from posecore.errors import RenderError
 from posecore.mesh import Mesh
 
 from synthgen.engines.blender.camera import blender_from_opencv
-from synthgen.engines.blender.materials import make_surface, set_look
+from synthgen.engines.blender.materials import make_surface, set_material
 from synthgen.engines.blender.meshes import make_mesh, make_texture
 from synthgen.engines.blender.visibility import show
 from synthgen.scene import SceneObject
@@ -20,7 +20,7 @@ from synthgen.scene import SceneObject
 # Cycles bakes the pose of an object whose mesh has no other user into the vertices, and then has to build the BVH again
 # at every move. With two users from the start a pose is only a matrix.
 FEWEST_PER_MESH = 2
-# Where unused objects wait, behind the camera. A hidden object is still in the BVH: one that stayed where it was last
+# Position of unused objects, behind the camera. A hidden object is still in the BVH: one that stayed where it was last
 # shown, or at the origin, which is the camera, would be visited by every ray (measured: 1.6 times the render).
 PARKED = Matrix.Translation((0.0, 0.0, 1e4))
 
@@ -35,7 +35,7 @@ class Props:
         self._boxes: dict[int, Float[np.ndarray, "8 3"]] = {}
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make the meshes' datablocks; a key that is known gets the new ones and the old ones are removed."""
+        """Make the meshes' datablocks; those of a loaded key are replaced and removed."""
         for key, mesh in meshes.items():
             block = make_mesh(key, mesh)
             block.materials.append(make_surface(f"surface_{key}", make_texture(key, mesh)))
@@ -59,8 +59,8 @@ class Props:
         used = dict.fromkeys(self._pools, 0)
         for number, item in enumerate(objects):
             if item.mesh_key not in used:
-                known = ", ".join(map(str, used)) or "none"
-                raise RenderError(f"object {number}: mesh key {item.mesh_key} is not loaded (loaded: {known})")
+                loaded = ", ".join(map(str, used)) or "none"
+                raise RenderError(f"object {number}: mesh key {item.mesh_key} is not loaded (loaded: {loaded})")
             pool = self._pools[item.mesh_key]
             if used[item.mesh_key] == len(pool):
                 pool.append(self._make_object(item.mesh_key))
@@ -68,7 +68,7 @@ class Props:
             used[item.mesh_key] += 1
             thing.pass_index = number + 1
             thing.matrix_basis = Matrix(blender_from_opencv(item.T_cam_obj).tolist())
-            set_look(thing, item.material)
+            set_material(thing, item.material)
             show(thing, shown=True)
         for key, pool in self._pools.items():
             for thing in pool[used[key] :]:

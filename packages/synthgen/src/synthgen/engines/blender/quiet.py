@@ -1,4 +1,4 @@
-"""Keeps Blender's chatter off the terminal without losing what it says when it fails."""
+"""Capture of Blender's output, which is kept for error messages."""
 
 import os
 import sys
@@ -12,15 +12,15 @@ from posecore.errors import RenderError
 
 @contextmanager
 def blender_output_caught(what: str) -> Iterator[None]:
-    """Catch what Blender's C++ code writes to the process's stdout and stderr.
+    """Capture the output of Blender's C++ code on stdout and stderr.
 
-    Blender has no switch for it: the file descriptors themselves are turned to a temporary file for the time being.
+    Blender has no option for it, so the file descriptors are redirected to a temporary file within the block.
 
     Args:
-        what: What is being done, for the message.
+        what: The action, for the message.
 
     Raises:
-        RenderError: From a RuntimeError or OSError inside, in one line with Blender's own last words.
+        RenderError: From a RuntimeError or OSError inside, in one line with Blender's last error message.
     """
     sys.stdout.flush()
     sys.stderr.flush()
@@ -48,6 +48,6 @@ def _tail(file: IO[bytes]) -> str:
 
 
 def _one_line(message: str, output: str) -> str:
-    said = [line.strip() for line in output.splitlines() if "error" in line.lower()]
+    errors = [line.strip() for line in output.splitlines() if "error" in line.lower()]
     text = " ".join(message.split())
-    return f"{text} (Blender: {said[-1]})" if said else text
+    return f"{text} (Blender: {errors[-1]})" if errors else text

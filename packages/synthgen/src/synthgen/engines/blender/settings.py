@@ -1,18 +1,18 @@
-"""Render settings of Cycles and EEVEE for small pictures: everything that costs time per picture is off."""
+"""Render settings of Cycles and EEVEE for small pictures: all options with a cost per picture are off."""
 
 import bpy
 
-from synthgen.engine import Device
 from synthgen.engines.blender.devices import gpu_counts, use_gpus
 from synthgen.engines.blender.materials import INDEX_AOV
 from synthgen.engines.devices import choose_device
+from synthgen.names import Device
 
 ENGINE_IDS = {"cycles": "CYCLES", "eevee": "BLENDER_EEVEE_NEXT"}
 COLOUR_FILTER_PX = 1.5
 
 
 def set_common(scene: bpy.types.Scene, *, engine: str, threads: int) -> None:
-    """Set what both engines share: linear float EXR with alpha, no post-processing.
+    """Set the common options of both engines: linear float EXR with alpha, no post-processing.
 
     Args:
         scene: Blender's scene.
@@ -50,7 +50,7 @@ def set_cycles(scene: bpy.types.Scene, *, device: Device) -> None:
 
     Args:
         scene: Blender's scene.
-        device: Where to trace; 'auto' takes the first of OptiX, CUDA and the CPU that is there.
+        device: Device; 'auto' takes the first available one of OptiX, CUDA and the CPU.
 
     Raises:
         RenderError: Cycles finds no such device.
@@ -67,8 +67,8 @@ def set_cycles(scene: bpy.types.Scene, *, device: Device) -> None:
     cycles.use_auto_tile = False
     cycles.use_light_tree = False
     cycles.use_guiding = False
-    # The automatic pattern (blue noise) keeps its length from the first render on, so a picture would depend on what
-    # was rendered before it with another number of samples.
+    # The automatic pattern (blue noise) keeps its length from the first render on, so that a picture would depend on
+    # earlier renders with another number of samples.
     cycles.sampling_pattern = "TABULATED_SOBOL"
     cycles.pixel_filter_type = "BLACKMAN_HARRIS"
     cycles.filter_width = COLOUR_FILTER_PX
@@ -86,7 +86,7 @@ def set_cycles(scene: bpy.types.Scene, *, device: Device) -> None:
 
 
 def set_eevee(scene: bpy.types.Scene) -> None:
-    """Set EEVEE to shadows and nothing that depends on the screen or on baked light.
+    """Set EEVEE to shadows, without screen-space effects and baked light.
 
     EEVEE has no object index pass; every material writes the index to an output variable instead.
     """

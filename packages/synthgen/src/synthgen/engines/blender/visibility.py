@@ -1,4 +1,4 @@
-"""Shows and hides pooled objects without making Cycles forget their meshes."""
+"""Visibility of pooled objects, without loss of their meshes in Cycles."""
 
 import bpy
 

@@ -1,4 +1,4 @@
-"""One render at a time in a dataset's folder."""
+"""Lock on a dataset's folder against a second writer."""
 
 import errno
 import fcntl
@@ -16,13 +16,13 @@ log = logging.getLogger(__name__)
 
 @contextmanager
 def held(url: str) -> Iterator[None]:
-    """Hold a local folder, which is made if need be, against other renders.
+    """Hold the lock of a local folder, which is created if necessary.
 
-    The lock is on the folder itself: it leaves no file behind, and the kernel drops it with the process, however that
-    ends. Object stores and file systems that know no locks are not held.
+    The lock is on the folder itself: it leaves no file, and the kernel releases it at the end of the process. Object
+    stores and file systems without locks are not locked.
 
     Raises:
-        StorageError: Another process holds it, or it cannot be made.
+        StorageError: Another process holds the lock, or the folder cannot be created.
     """
     if "://" in url:
         yield
@@ -41,7 +41,7 @@ def held(url: str) -> Iterator[None]:
                     f"{url}: another synthgen is rendering into this folder; wait for it, stop it, or choose another "
                     "--out"
                 ) from error
-            log.warning("%s: cannot be locked (%s); see to it that only one render writes there", url, error.strerror)
+            log.warning("%s: cannot be locked (%s); make sure that only one render writes there", url, error.strerror)
         yield
     finally:
         os.close(descriptor)
