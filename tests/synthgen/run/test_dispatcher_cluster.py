@@ -181,5 +181,5 @@ def test_workers_and_scheduler_exclude_each_other(tmp_path, tug_ply, small_set):
     arguments = command(tug_ply, tmp_path / "shards", small_set, "--scheduler", "tcp://node0:8786", "--workers", "2")
     result = CliRunner().invoke(main, arguments[3:])
     assert result.exit_code == 2
-    assert "give one of them" in result.stderr
+    assert "give only one option" in result.stderr
     assert not (tmp_path / "shards").exists()
