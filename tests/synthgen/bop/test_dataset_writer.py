@@ -344,8 +344,8 @@ def test_the_commands_options_reach_the_dataset(tmp_path, tug_ply, small_set):
     card = json.loads((out / "synthgen.json").read_text())
     assert (card["sequences"], card["split"], card["config"]["sequence"]["fps"]) == (2, "val", 10.0)
     for arguments, message in (
-        (["--fps", 10], "--fps: only sequences have it"),
-        (["--sequences", 2], "--sequences: only sequences have it"),
+        (["--fps", 10], "--fps: is for sequences alone; add --sequence"),
+        (["--sequences", 2], "--sequences: is for sequences alone; add --sequence"),
         (["--sequence", "--frames-per-scene", 5], "--frames-per-scene: a sequence is one scene"),
         (["--objects-per-frame", 5, 2], r"frames.*objects is \[5, 2\]"),
     ):
