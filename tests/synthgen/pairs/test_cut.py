@@ -404,7 +404,9 @@ def test_wrong_inputs_are_one_line_each(images, own, tmp_path):
     mask.write_bytes(whole)
     file = next(own.split_path.rglob("rgb/000001.png"))
     cv2.imwrite(str(file), np.zeros((100, 90, 3), np.uint8))
-    with pytest.raises(DatasetError, match=r"320 x 240 pixels and image 1 of scene 1 90 x 100, expected images of one"):
+    with pytest.raises(
+        DatasetError, match=r"320 x 240 pixels and image 1 of scene 1 90 x 100, expected images of equal size"
+    ):
         cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL))
     for file in own.split_path.rglob("scene_gt.json"):
         file.unlink()

@@ -73,13 +73,13 @@ def test_the_image_shows_the_object_inside_its_contour(maker_of, patch_px):
     for scene_index in range(4):
         s = maker.samples(scene_index)
         draw, _ = maker.accepted_scene(scene_index)
-        shot = maker._shoot(draw, [Window(x0_px=x, y0_px=y, side_px=w) for x, y, w in s["window_px"]])
+        image = maker._render(draw, [Window(x0_px=x, y0_px=y, side_px=w) for x, y, w in s["window_px"]])
         for i in range(2):
             from posecore.window import cut
 
-            x, y, side = s["window_px"][i] * shot.scale
-            local = Window(x0_px=x - shot.region_px[0], y0_px=y - shot.region_px[1], side_px=side)
-            coverage = cut(shot.rendered.alpha, local, patch_px)
+            x, y, side = s["window_px"][i] * image.scale
+            local = Window(x0_px=x - image.region_px[0], y0_px=y - image.region_px[1], side_px=side)
+            coverage = cut(image.rendered.alpha, local, patch_px)
             amodal = (s["scene_mask"][i] & BIT_OBJECT) > 0
             rows, columns = np.mgrid[:patch_px, :patch_px] + 0.5
             centre = [(m * a).sum() / a.sum() for a in (coverage, amodal * 1.0) for m in (rows, columns)]

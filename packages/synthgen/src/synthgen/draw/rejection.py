@@ -30,7 +30,7 @@ def nothing_accepted(scene_index: int, name: str, tally: Tally, config: SynthCon
         "outside": "the object outside the image",
         "small": "its silhouette too small",
         "hidden": "the object too occluded",
-        "no hypothesis": "no acceptable hypothesis",
+        "no hypothesis": "no hypothesis accepted",
     }
     counted = ", ".join(f"{count} x {descriptions[reason]}" for reason, count in scenes.items())
     advice = _advice(worst, tally, config)
