@@ -68,7 +68,7 @@ def test_each_worker_sees_one_gpu(config_of, tug):
 
 def test_a_blender_that_does_not_start_is_one_line(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nowhere/python")
-    with pytest.raises(RenderError, match=r"Blender cannot be asked for its GPUs .*use --device cpu"):
+    with pytest.raises(RenderError, match=r"Blender cannot list its GPUs .*use --device cpu"):
         devices.list_gpus()
     failed = subprocess.CalledProcessError(1, "python", stderr="Traceback\nImportError: libGL.so")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: (_ for _ in ()).throw(failed))

@@ -113,7 +113,7 @@ def test_a_foreign_folder_is_never_replaced(shards, tmp_path):
     (tmp_path / "home").mkdir()
     (tmp_path / "home/thesis.tex").write_text("precious")
     result = run(shards, tmp_path / "home", "--format", "webdataset", "--overwrite")
-    assert result.exit_code == 1 and "a folder that no export made" in result.output
+    assert result.exit_code == 1 and "is not an exported folder" in result.output
     assert (tmp_path / "home/thesis.tex").read_text() == "precious"
 
 
@@ -127,7 +127,7 @@ def test_damaged_and_unfinished_datasets_leave_nothing(shards, tmp_path, out):
         write(str(copy), tmp_path / out)
     lines = (copy / "manifest.jsonl").read_text().splitlines()
     (copy / "manifest.jsonl").write_text("\n".join(lines[:2]) + "\n")
-    with pytest.raises(ShardError, match="2 of 3 shards are there; finish it first"):
+    with pytest.raises(ShardError, match="2 of 3 shards are committed; complete it first"):
         write(str(copy), tmp_path / out)
     assert [p.name for p in tmp_path.iterdir()] == ["copy"]
 

@@ -96,7 +96,7 @@ def test_what_does_not_fit_together_is_one_line(parts, config_of, tug, bobbin_pl
     with pytest.raises(ShardError, match=r"holds the same pairs as .*tug; name it once"):
         open_parts([parts[0], parts[0]])
     write_dataset(tmp_path / "half", config_of("seed=7"), {1: tug}, 8, shards=1)
-    with pytest.raises(ShardError, match="1 of 2 shards are there"):
+    with pytest.raises(ShardError, match="1 of 2 shards are committed"):
         open_parts([parts[0], str(tmp_path / "half")])
     alone = CliRunner().invoke(main, ["merge", parts[0], "--out", str(tmp_path / "x")])
     assert alone.exit_code == 2
