@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from error_tables import errors_table
-from evalkit.scores.convergence import by_level, by_level_and_object, level_object_tables, level_tables
+from evalkit.scores.convergence import by_level, by_level_and_object
+from evalkit.tables.convergence import level_object_tables, level_tables
 from evalkit.tables.model import Interval
 
 

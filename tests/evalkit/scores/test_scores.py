@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from error_tables import errors_table
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores import (
     DEFINITIONS,
     AllErrors,
@@ -15,7 +16,7 @@ from evalkit.scores import (
     with_bop19,
 )
 from evalkit.scores.bop_matching import average_precision, greedy_matches, ranks, target_truths
-from evalkit.scores.definitions import MSPD_PX, MSSD_DIAMETERS, VSD_COLUMNS, VSD_LIMITS
+from evalkit.scores.definitions import MSPD_PX, MSSD_DIAMETERS, VSD_LIMITS
 from evalkit.scores.per_pose import under
 
 NAN = float("nan")

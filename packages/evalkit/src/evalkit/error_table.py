@@ -12,18 +12,18 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
-class Column:
+class ErrorColumn:
     """A column: its dtype, and what it holds, with its unit."""
 
     dtype: str
     text: str
 
 
-def _columns(dtype: str, **texts: str) -> dict[str, Column]:
-    return {name: Column(dtype=dtype, text=text) for name, text in texts.items()}
+def _columns(dtype: str, **texts: str) -> dict[str, ErrorColumn]:
+    return {name: ErrorColumn(dtype=dtype, text=text) for name, text in texts.items()}
 
 
-COLUMNS: Mapping[str, Column] = {
+COLUMNS: Mapping[str, ErrorColumn] = {
     **_columns(
         "int64",
         scene_id="scene",

@@ -51,8 +51,8 @@ def tables(
     from posecore.bop import BopDataset
 
     from evalkit.inputs.result_files import dataset_of, find_result_files
-    from evalkit.tables.model import require_suffixes, text_of, write_tables
     from evalkit.tables.paper import paper_tables, score_files
+    from evalkit.tables.writers import require_suffixes, text_of, write_tables
 
     require_suffixes(out)
     here = Path()

@@ -53,7 +53,8 @@ def tracking(
     from posecore.errors import ConfigError
 
     from evalkit.inputs.result_files import dataset_of, load_result_files
-    from evalkit.tables.model import markdown, require_suffixes, write_tables
+    from evalkit.tables.markdown import markdown
+    from evalkit.tables.writers import require_suffixes, write_tables
     from evalkit.tracking import axis_table, frames_of, named_tracks, sequence_table, tracks_of
 
     require_suffixes(out)

@@ -14,7 +14,7 @@ from evalkit.report import html
 from evalkit.report.html import Section
 from evalkit.report.page import cases
 from evalkit.scores import DEFINITIONS
-from evalkit.tables.model import Cell, Column, Interval, Row, Table
+from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 
 NAN = float("nan")
 
@@ -72,11 +72,11 @@ def _table(difference: Difference, kind: str, measures: Mapping[str, Measure], n
     a, b = difference.sides.a.name, difference.sides.b.name
     digits = max(measure.digits for measure in measures.values())
     columns = [
-        Column(key="measure", heading="measure"),
-        Column(key="about", heading="what it is"),
-        Column(key="poses", heading="poses", digits=0),
+        TableColumn(key="measure", heading="measure"),
+        TableColumn(key="about", heading="what it is"),
+        TableColumn(key="poses", heading="poses", digits=0),
         *[
-            Column(key=f"{statistic}_{side}", heading=heading, group=statistic, digits=digits)
+            TableColumn(key=f"{statistic}_{side}", heading=heading, group=statistic, digits=digits)
             for statistic in ("mean", "median")
             for side, heading in (("a", a), ("b", b), ("delta", "delta"))
         ],

@@ -21,9 +21,9 @@ from posecore.raster import Rasteriser
 from evalkit.error_table import table_of
 from evalkit.inputs.pairing import Pair, pair_up
 from evalkit.inputs.result_files import load_result_files
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.pose_errors.scorer import Scorer
 from evalkit.scores.bop_matching import AllErrors, with_bop19
-from evalkit.scores.definitions import VSD_COLUMNS
 
 VssKind = Literal["full", "visible"]
 Progress = Callable[[int], None]

@@ -14,6 +14,8 @@ from posecore.files import sha256_file
 log = logging.getLogger(__name__)
 
 START_METHOD = "start"
+UNREFINED = "no refinement"
+"""Name of the initial poses in tables, as in the 2018 paper's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,3 +145,26 @@ def _unique_names(paths: Sequence[Path]) -> list[str]:
         return stems
     longer = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     return longer if len(set(longer)) == len(longer) else [str(path) for path in paths]
+
+
+def method_names(files: Sequence[ResultFile]) -> list[str]:
+    """Names that differ: sidecar's `method` and `loss`, start poses "no refinement"; the file's name where these fail.
+
+    A loss is looked for as `loss` in the sidecar and in its `settings`.
+    """
+    described = [_described(file) for file in files]
+    count = Counter(described)
+    return [
+        (f"{name} ({file.name})" if name else file.name) if count[name] > 1 or not name else name
+        for name, file in zip(described, files, strict=True)
+    ]
+
+
+def _described(file: ResultFile) -> str:
+    if file.is_start:
+        return UNREFINED
+    settings = file.sidecar.get("settings")
+    inner = settings.get("loss") if isinstance(settings, dict) else None
+    method, loss = file.sidecar.get("method"), file.sidecar.get("loss", inner)
+    parts = [method if isinstance(method, str) else "", f"{loss} loss" if isinstance(loss, str) and loss else ""]
+    return ", ".join(part for part in parts if part)

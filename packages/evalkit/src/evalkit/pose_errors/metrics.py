@@ -18,6 +18,10 @@ Poses = Float[Array, "*b 4 4"]
 Errors = Float[Array, "*b"]
 Points = Float[Array, "n 3"]
 Symmetries = Float[Array, "*g s 4 4"]
+VSD_TAUS = np.arange(0.05, 0.51, 0.05)
+"""Tolerances of BOP19's VSD, diameters."""
+VSD_COLUMNS = tuple(f"vsd_{tau:.2f}" for tau in VSD_TAUS)
+"""Columns of the error table with VSD at these tolerances."""
 BOP_RAY_PX = 0.0
 """Where in a pixel bop_toolkit's rays go through when it turns depth into distance."""
 

@@ -16,9 +16,9 @@ from posecore.raster import Rasteriser
 from evalkit.error_table import table_of
 from evalkit.inputs.pairing import Pair
 from evalkit.pose_errors import metrics, silhouettes
+from evalkit.pose_errors.metrics import VSD_COLUMNS, VSD_TAUS
 from evalkit.pose_errors.per_object import ERRORS, Model, pose_errors
 from evalkit.pose_errors.silhouettes import Patch
-from evalkit.scores.definitions import VSD_COLUMNS, VSD_TAUS
 
 Array = np.ndarray
 KEPT_BYTES = 256_000_000

@@ -17,8 +17,8 @@ from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.result_files import load_result_files
 from evalkit.report.page import report_page
 from evalkit.report.summary import summarise
-from evalkit.tables.model import write_tables
 from evalkit.tables.report_tables import report_tables
+from evalkit.tables.writers import write_tables
 
 Start = Callable[[str, int], Callable[[int], None]]
 """Announces a result file and its number of poses; returns what is called as they are done."""

@@ -17,6 +17,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from evalkit.error_table import column
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores.definitions import (
     BOP24_ESTIMATES,
     BOP24_VISIBLE,
@@ -25,7 +26,6 @@ from evalkit.scores.definitions import (
     MSSD_DIAMETERS,
     MSSD_MM,
     RECALL_LEVELS,
-    VSD_COLUMNS,
     VSD_LIMITS,
 )
 from evalkit.scores.per_pose import in_diameters

@@ -18,10 +18,7 @@ MSPD_PX = np.arange(5.0, 51.0, 5.0)
 """For images 640 pixels wide; an error is scaled by 640 / width first."""
 MSPD_WIDTH_PX = 640.0
 MSSD_MM = np.arange(2.0, 21.0, 2.0)
-VSD_TAUS = np.arange(0.05, 0.51, 0.05)
-"""Tolerances in diameters."""
 VSD_LIMITS = np.arange(0.05, 0.51, 0.05)
-VSD_COLUMNS = tuple(f"vsd_{tau:.2f}" for tau in VSD_TAUS)
 BOP24_VISIBLE = 0.1
 """A true instance with a smaller visible share asks for nothing, and an estimate of it is not wrong."""
 BOP24_ESTIMATES = 100

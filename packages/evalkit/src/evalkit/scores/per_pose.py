@@ -9,6 +9,7 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from evalkit.error_table import column
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores.definitions import (
     AUC_LIMIT_DIAMETERS,
     AUC_LIMIT_M,
@@ -20,7 +21,6 @@ from evalkit.scores.definitions import (
     RECALL_DIAMETERS,
     ROUNDING_M,
     ROUNDING_RAD,
-    VSD_COLUMNS,
     VSD_LIMITS,
 )
 

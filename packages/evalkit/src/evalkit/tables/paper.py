@@ -9,7 +9,8 @@ from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.perturbation import departures
 from evalkit.inputs.result_files import load_result_files
-from evalkit.scores.convergence import by_level, by_level_and_object, level_object_tables, level_tables
+from evalkit.scores.convergence import by_level, by_level_and_object
+from evalkit.tables.convergence import level_object_tables, level_tables
 from evalkit.tables.model import Table
 from evalkit.tables.paper_refinement import (
     By,

@@ -1,18 +1,20 @@
 """The tables of a report, described once: the page, Markdown and LaTeX show the same rows and numbers."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
-from evalkit.scores.convergence import level_tables
 from evalkit.scores.failure_causes import CAUSES
-from evalkit.tables.model import Better, Cell, Column, Interval, Row, Table
+from evalkit.tables.convergence import level_tables
+from evalkit.tables.model import Better, Cell, Interval, Row, Table, TableColumn
 
 Values = Mapping[str, Any]
 Best = Literal["column", "row", ""]
+TOTAL = "total"
 
 
-def _column(group: str, heading: str, key: str, unit: str, digits: int, better: Better = "") -> Column:
-    return Column(key=key, heading=heading, group=group, unit=unit, digits=digits, better=better)
+def _column(group: str, heading: str, key: str, unit: str, digits: int, better: Better = "") -> TableColumn:
+    return TableColumn(key=key, heading=heading, group=group, unit=unit, digits=digits, better=better)
 
 
 SCORE_COLUMNS = (
@@ -49,7 +51,7 @@ PRECISION_COLUMNS = (
 )
 
 
-def _mean_and_median(group: str, key: str, unit: str, digits: int = 2) -> tuple[Column, Column]:
+def _mean_and_median(group: str, key: str, unit: str, digits: int = 2) -> tuple[TableColumn, TableColumn]:
     return (
         _column(group, "mean", f"{key}_mean", unit, digits, "lower"),
         _column(group, "median", f"{key}_median", unit, digits, "lower"),
@@ -111,7 +113,7 @@ CAUSE_COLUMNS = (
     _column("poses", "expected", "expected", "", 0),
     _column("poses", "failed", "failed", "%", 1),
     *(
-        Column(key=cause, heading=cause, group="failed because of", unit="%", digits=1, about=text)
+        TableColumn(key=cause, heading=cause, group="failed because of", unit="%", digits=1, about=text)
         for cause, text in CAUSES.items()
     ),
 )
@@ -136,15 +138,13 @@ def report_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def total_tables(summary: Mapping[str, Any]) -> list[Table]:
     """A row for each result file: its scores, and its errors."""
-    rows = [
-        ({"name": file["name"]}, file["total"], file["intervals"]["total"]["intervals"]) for file in summary["files"]
-    ]
-    first = Column(key="name", heading="result file")
+    rows = [(file["name"], *_scores(file, TOTAL)) for file in summary["files"]]
+    first = TableColumn(key="name", heading="result file")
     resampled = ", ".join(dict.fromkeys(_resampled(file["intervals"]["total"]) for file in summary["files"]))
     interval_note = _interval_note(resampled)
     tables = [
-        _table(title, name, first, rows, columns, note=note if place else interval_note)
-        for place, (title, name, columns, note) in enumerate(SCORE_TABLES)
+        _table(title, name, first, rows, columns, note=note if index else interval_note)
+        for index, (title, name, columns, note) in enumerate(SCORE_TABLES)
     ]
     return [table for table in tables if len(table.columns) > 1]
 
@@ -152,19 +152,14 @@ def total_tables(summary: Mapping[str, Any]) -> list[Table]:
 def object_tables(summary: Mapping[str, Any]) -> dict[str, list[Table]]:
     """For each result file, by name: scores and errors of its objects and in total."""
     tables = {}
-    for place, file in enumerate(summary["files"]):
-        name, intervals = file["name"], file["intervals"]
-        rows = [
-            ({"name": f"object {obj_id}"}, values, intervals["by_object"][obj_id]["intervals"])
-            for obj_id, values in file["by_object"].items()
-        ]
-        rows.append(({"name": "total"}, file["total"], intervals["total"]["intervals"]))
-        first = Column(key="name", heading="object")
+    for index, file in enumerate(summary["files"]):
+        rows = [(_group_name(group), *_scores(file, group)) for group in (*file["by_object"], TOTAL)]
+        first = TableColumn(key="name", heading="object")
         described = [
-            _table(f"{title} of {name} by object", f"{slug}-objects-{place}", first, rows, columns, True, note)
+            _table(f"{title} of {file['name']} by object", f"{slug}-objects-{index}", first, rows, columns, True, note)
             for title, slug, columns, note in SCORE_TABLES
         ]
-        tables[name] = [table for table in described if len(table.columns) > 1]
+        tables[file["name"]] = [table for table in described if len(table.columns) > 1]
     return tables
 
 
@@ -176,37 +171,34 @@ def comparison_tables(summary: Mapping[str, Any]) -> list[Table]:
     obj_ids = sorted({obj_id for file in files for obj_id in file["by_object"]}, key=int)
     tables = []
     for shown in COMPARED:
-        columns = [
-            Column(
-                key=f"{shown.key}_{place}",
-                heading=file["name"],
-                unit=shown.unit,
-                digits=shown.digits,
-                better=shown.better,
-            )
-            for place, file in enumerate(files)
-        ]
+        columns = [replace(shown, key=f"{shown.key}_{index}", heading=file["name"]) for index, file in enumerate(files)]
         rows = []
-        for obj_id in obj_ids:
-            cells: dict[str, Cell] = {"object": f"object {obj_id}"}
+        for group in (*obj_ids, TOTAL):
+            cells: dict[str, Cell] = {"object": _group_name(group)}
             for column, file in zip(columns, files, strict=True):
-                intervals = file["intervals"]["by_object"].get(obj_id, {}).get("intervals", {})
-                cells[column.key] = _cell(file["by_object"].get(obj_id, {}), intervals, shown.key)
-            rows.append(Row(cells=cells))
-        total: dict[str, Cell] = {"object": "total"}
-        for column, file in zip(columns, files, strict=True):
-            total[column.key] = _cell(file["total"], file["intervals"]["total"]["intervals"], shown.key)
-        rows.append(Row(cells=total, total=True))
+                cells[column.key] = _cell(*_scores(file, group), shown.key)
+            rows.append(Row(cells=cells, total=group == TOTAL))
         tables.append(
             Table(
                 title=shown.heading,
                 name=f"compare-{shown.key.replace('_', '-').replace('.', '')}",
-                columns=[Column(key="object", heading="object"), *columns],
+                columns=[TableColumn(key="object", heading="object"), *columns],
                 rows=rows,
                 best="row",
             )
         )
     return tables
+
+
+def _scores(file: Values, group: str) -> tuple[Values, Values]:
+    """Scores and intervals of one object of a file, or of all under `TOTAL`; empty without that object."""
+    if group == TOTAL:
+        return file["total"], file["intervals"]["total"]["intervals"]
+    return file["by_object"].get(group, {}), file["intervals"]["by_object"].get(group, {}).get("intervals", {})
+
+
+def _group_name(group: str) -> str:
+    return group if group == TOTAL else f"object {group}"
 
 
 def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -224,7 +216,7 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
         if rows:
             digits = 0 if all(low == round(low) for low, _ in rows) else 2
             first = [_column(axis, heading, key, "", digits) for heading, key in (("from", "low"), ("to", "high"))]
-            first += [Column(key="file", heading="result file")] if several else []
+            first += [TableColumn(key="file", heading="result file")] if several else []
             counts = [_column("poses", key, key, "", 0) for key in ("expected", "found")]
             described = [Row(cells=cells, group=f"{low:g}") for (low, _), cells in sorted(rows.items())]
             tables.append(
@@ -242,7 +234,7 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
 def cause_tables(summary: Mapping[str, Any]) -> list[Table]:
     """Why poses failed, see `evalkit.scores.failure_causes`: causes down, result files across; then a table a file."""
     files = summary["files"]
-    columns = [Column(key="cause", heading="cause")]
+    columns = [TableColumn(key="cause", heading="cause")]
     rows: dict[str, dict[str, Cell]] = {
         cause: {"cause": cause, "meaning": CAUSES.get(cause, "")} for cause in (*CAUSES, "all failures")
     }
@@ -253,7 +245,7 @@ def cause_tables(summary: Mapping[str, Any]) -> list[Table]:
         for cause, cells in rows.items():
             count = counts["failed" if cause == "all failures" else cause]
             cells |= {poses: count, share: count / counts["expected"] if counts["expected"] else None}
-    columns.append(Column(key="meaning", heading="what it means"))
+    columns.append(TableColumn(key="meaning", heading="what it means"))
     return [
         Table(
             title="Failures by cause",
@@ -268,12 +260,14 @@ def cause_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def _object_causes(file: Mapping[str, Any], place: int) -> Table:
-    named = [(name if name == "total" else f"object {name}", counts) for name, counts in file["causes"].items()]
     return Table(
         title=f"Failures of {file['name']} by cause and object",
         name=f"causes-objects-{place}",
-        columns=[Column(key="name", heading="object"), *CAUSE_COLUMNS],
-        rows=[Row(cells={"name": name} | _cause_cells(counts), total=name == "total") for name, counts in named],
+        columns=[TableColumn(key="name", heading="object"), *CAUSE_COLUMNS],
+        rows=[
+            Row(cells={"name": _group_name(group)} | _cause_cells(counts), total=group == TOTAL)
+            for group, counts in file["causes"].items()
+        ],
         best="",
     )
 
@@ -299,25 +293,25 @@ def curve_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def _table(
     title: str,
-    name: str,
-    first: Column,
-    rows: Sequence[tuple[Mapping[str, str], Values, Values]],
-    columns: Sequence[Column],
+    slug: str,
+    first: TableColumn,
+    rows: Sequence[tuple[str, Values, Values]],
+    columns: Sequence[TableColumn],
     total_last: bool = False,
     note: str = "",
 ) -> Table:
-    """A table from names, scores and their intervals; columns without any value are left out."""
+    """A table with a row for each name, its scores and their intervals; columns without any value are left out."""
     kept = [column for column in columns if any(values.get(column.key) is not None for _, values, _ in rows)]
     described = [
         Row(
-            cells=dict(names) | {column.key: _cell(values, intervals, column.key) for column in kept},
-            total=total_last and place == len(rows) - 1,
+            cells={first.key: name} | {column.key: _cell(values, intervals, column.key) for column in kept},
+            total=total_last and index == len(rows) - 1,
         )
-        for place, (names, values, intervals) in enumerate(rows)
+        for index, (name, values, intervals) in enumerate(rows)
     ]
     columns = [first, *kept]
     best: Best = "" if total_last else "column"  # objects are no competitors
-    return Table(title=title, name=name, columns=columns, rows=described, note=note, best=best)
+    return Table(title=title, name=slug, columns=columns, rows=described, note=note, best=best)
 
 
 def _cell(values: Values, intervals: Values, key: str) -> Cell:

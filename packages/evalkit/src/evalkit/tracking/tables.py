@@ -5,41 +5,38 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evalkit.inputs.result_files import ResultFile
+from evalkit.inputs.result_files import ResultFile, method_names
 from evalkit.scores.bootstrap import Units, resample
 from evalkit.scores.per_pose import Values
-from evalkit.tables.model import Cell, Column, Interval, Row, Table
-from evalkit.tables.paper_refinement import method_names
+from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 from evalkit.tracking.scores import ANGLES, AXES, track_scores
 from evalkit.tracking.tracks import Track
 
 Array = np.ndarray
+
+
+def _rms_column(key: str, heading: str, unit: str, about: str = "") -> TableColumn:
+    return TableColumn(key=key, heading=heading, group="RMS", unit=unit, digits=2, better="lower", about=about)
+
+
 RMS_COLUMNS = (
-    *(
-        Column(
-            key=f"{axis}_rms_mm", heading=axis, group="RMS", unit="mm", digits=2, better="lower", about=f"camera {axis}"
-        )
-        for axis in AXES
-    ),
-    *(
-        Column(key=f"{name}_rms_deg", heading=name, group="RMS", unit="deg", digits=2, better="lower")
-        for name in ANGLES
-    ),
+    *(_rms_column(f"{axis}_rms_mm", axis, "mm", about=f"camera {axis}") for axis in AXES),
+    *(_rms_column(f"{name}_rms_deg", name, "deg") for name in ANGLES),
 )
 TRACK_COLUMNS = (
-    Column(key="frames", heading="frames", digits=0),
-    Column(key="lost", heading="lost", digits=0, better="lower", about="frames without an estimate"),
+    TableColumn(key="frames", heading="frames", digits=0),
+    TableColumn(key="lost", heading="lost", digits=0, better="lower", about="frames without an estimate"),
     *RMS_COLUMNS,
-    Column(key="success_5cm5deg", heading="5 cm 5°", unit="%", digits=1, better="higher"),
-    Column(key="failed", heading="failed", digits=0, about="frames outside of 5 cm or 5 degrees, lost ones too"),
-    Column(
+    TableColumn(key="success_5cm5deg", heading="5 cm 5°", unit="%", digits=1, better="higher"),
+    TableColumn(key="failed", heading="failed", digits=0, about="frames outside of 5 cm or 5 degrees, lost ones too"),
+    TableColumn(
         key="resets", heading="resets", digits=0, about="how often the tracker was set to the truth after a failure"
     ),
-    Column(key="jitter_mm_median", heading="median", group="jitter", unit="mm", digits=2, better="lower"),
-    Column(key="jitter_mm_p95", heading="95 %", group="jitter", unit="mm", digits=2, better="lower"),
-    Column(key="jitter_deg_median", heading="median", group="jitter", unit="deg", digits=2, better="lower"),
-    Column(key="jitter_deg_p95", heading="95 %", group="jitter", unit="deg", digits=2, better="lower"),
-    Column(key="time_ms_mean", heading="time", unit="ms", digits=1, better="lower", about="mean of a frame"),
+    TableColumn(key="jitter_mm_median", heading="median", group="jitter", unit="mm", digits=2, better="lower"),
+    TableColumn(key="jitter_mm_p95", heading="95 %", group="jitter", unit="mm", digits=2, better="lower"),
+    TableColumn(key="jitter_deg_median", heading="median", group="jitter", unit="deg", digits=2, better="lower"),
+    TableColumn(key="jitter_deg_p95", heading="95 %", group="jitter", unit="deg", digits=2, better="lower"),
+    TableColumn(key="time_ms_mean", heading="time", unit="ms", digits=1, better="lower", about="mean of a frame"),
 )
 SUMMED = ("frames", "lost", "failed", "resets")
 TOTAL = "mean of sequences"
@@ -85,12 +82,12 @@ def sequence_table(
         for item, scores in zip(tracked, scored, strict=True)
         if len(scores) > 1
     ]
-    method = [Column(key="method", heading="method")] if len(tracked) > 1 else []
+    method = [TableColumn(key="method", heading="method")] if len(tracked) > 1 else []
     shown = {column.key for column in (*method, *TRACK_COLUMNS)} | {"sequence"}
     return Table(
         title="Tracking by sequence",
         name="tracking",
-        columns=[Column(key="sequence", heading="sequence"), *method, *TRACK_COLUMNS],
+        columns=[TableColumn(key="sequence", heading="sequence"), *method, *TRACK_COLUMNS],
         rows=[
             Row(cells={key: cell for key, cell in row.cells.items() if key in shown}, group=row.group, total=row.total)
             for row in [*(row for part in rows.values() for row in part), *totals]
@@ -151,12 +148,13 @@ def axis_table(tracked: Sequence[TrackedFile], *, choi_legacy: bool = False) -> 
             cells: dict[str, Cell] = {f"rms_{place}": values[shown.key] for place, values in by_method.items()}
             rows.append(Row(cells=cells | {"sequence": name, "axis": shown.title}, group=name))
     columns = [
-        Column(key=f"rms_{place}", heading=item.name, digits=2, better="lower") for place, item in enumerate(tracked)
+        TableColumn(key=f"rms_{place}", heading=item.name, digits=2, better="lower")
+        for place, item in enumerate(tracked)
     ]
     return Table(
         title="Tracking, RMS by axis",
         name="tracking-axes",
-        columns=[Column(key="sequence", heading="sequence"), Column(key="axis", heading="RMS"), *columns],
+        columns=[TableColumn(key="sequence", heading="sequence"), TableColumn(key="axis", heading="RMS"), *columns],
         rows=rows,
         note=_note(tracked, choi_legacy),
         best="row",

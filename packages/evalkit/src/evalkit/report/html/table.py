@@ -2,7 +2,7 @@
 
 from html import escape
 
-from evalkit.tables.model import Column, Row, Table, best_cells, cell_text, column_groups, number_of
+from evalkit.tables.model import Row, Table, TableColumn, best_cells, cell_text, column_groups, number_of
 
 ALARMS = ("missing",)
 """Columns whose values other than 0 are set in red."""
@@ -91,5 +91,5 @@ def _classes(*names: str) -> str:
     return f' class="{kept}"' if kept else ""
 
 
-def _tooltip(column: Column) -> str:
+def _tooltip(column: TableColumn) -> str:
     return f' title="{escape(column.about)}"' if column.about else ""
