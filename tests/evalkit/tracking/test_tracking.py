@@ -11,7 +11,6 @@ from evalkit.tracking import (
     axis_table,
     changes,
     euler_deg,
-    legacy_angles_deg,
     residuals,
     run_with_resets,
     sequence_table,
@@ -118,29 +117,19 @@ def test_euler_angles_are_those_of_rz_ry_rx():
 def test_359_degrees_against_1_and_181_against_179_are_errors_of_2(true, estimated):
     T_gt = np.stack([se3.make_T(about(Z, true), np.array([0, 0, 0.5]))] * 3)
     T_est = np.stack([se3.make_T(about(Z, estimated), np.array([0, 0, 0.5]))] * 3)
-    for choi_legacy in (False, True):
-        scores = track_scores(track(T_est, T_gt), choi_legacy=choi_legacy)
-        assert scores["yaw_rms_deg"] == pytest.approx(2.0)
-        assert scores["roll_rms_deg"] == pytest.approx(0.0, abs=1e-6)
+    scores = track_scores(track(T_est, T_gt))
+    assert scores["yaw_rms_deg"] == pytest.approx(2.0)
+    assert scores["roll_rms_deg"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_legacy_angles_are_unwrapped_where_a_sequence_passes_180_degrees():
-    # Truth turns from 170 to 190 degrees; the estimate is 4 degrees ahead and passes 180 earlier.
-    yaw = np.arange(170.0, 191.0, 2.0)
-    R_gt = np.stack([about(Z, angle) for angle in yaw])
-    R_est = np.stack([about(Z, angle + 4.0) for angle in yaw])
-    np.testing.assert_allclose(legacy_angles_deg(R_est, R_gt)[:, 2], 4.0, atol=1e-9)
-    wrapped = euler_deg(R_est)[:, 2] - euler_deg(R_gt)[:, 2]
-    assert np.abs(wrapped).max() > 300.0  # what a plain difference would hold
-
-
-def test_legacy_angles_exaggerate_where_the_pitch_is_near_90_degrees():
-    # One degree about x, at a pitch of 89: roll and yaw run apart, the residual's angles do not.
+def test_angles_stay_small_where_the_pitch_is_near_90_degrees():
+    # One degree about x, at a pitch of 89: roll and yaw of the poses run apart, the residual's angles do not.
     T_gt = np.stack([se3.make_T(about(Y, 89.0), np.array([0, 0, 0.5]))] * 2)
     T_est = off(T_gt, about(X, 1.0))
-    old, new = (track_scores(track(T_est, T_gt), choi_legacy=legacy) for legacy in (True, False))
-    assert new["roll_rms_deg"] == pytest.approx(1.0)
-    assert old["yaw_rms_deg"] > 20.0
+    scores = track_scores(track(T_est, T_gt))
+    assert scores["roll_rms_deg"] == pytest.approx(1.0)
+    assert scores["yaw_rms_deg"] == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(euler_deg(T_est[0, :3, :3]) - euler_deg(T_gt[0, :3, :3])).max() > 20.0  # as a plain difference
 
 
 def test_residuals_are_in_camera_axes():
@@ -168,7 +157,7 @@ def test_lost_frames_fail_and_have_no_part_in_the_rms():
 
 def test_a_sequence_that_is_lost_altogether_has_no_errors():
     T_gt = moving(3)
-    scores = track_scores(track(np.full_like(T_gt, np.nan), T_gt), choi_legacy=True)
+    scores = track_scores(track(np.full_like(T_gt, np.nan), T_gt))
     assert (scores["lost"], scores["success_5cm5deg"]) == (3.0, 0.0)
     assert np.isnan([scores["x_rms_mm"], scores["yaw_rms_deg"], scores["time_ms_mean"]]).all()
 

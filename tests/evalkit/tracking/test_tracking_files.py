@@ -161,16 +161,12 @@ def test_several_files_stand_side_by_side_and_are_written_as_asked(sequence, tmp
     assert r"\textbf{0.00}" in (tmp_path / "t.tex").read_text()
 
 
-def test_choi_legacy_is_said(sequence, tmp_path):
-    write_results(tmp_path / "r.csv", tugs())
-    assert "Choi legacy" in run("--dataset", sequence, "--results", tmp_path / "r.csv", "--choi-legacy").output
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
         (("--scene", 9), 2, "none of its targets has this --scene and --object"),
         (("--out", "t.docx"), 2, "t.docx: found suffix '.docx'"),
+        (("--choi-legacy",), 2, "--choi-legacy: removed, angles are always those of the residual rotation"),
     ],
 )
 def test_mistakes_are_one_line(sequence, tmp_path, arguments, code, message):

@@ -1,9 +1,13 @@
 """What several commands have in common."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
+from posecore.errors import ConfigError
+
+Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 class Numbers(click.ParamType):
@@ -19,6 +23,16 @@ class Numbers(click.ParamType):
             return tuple(float(part) for part in str(value).split(",") if part.strip())
         except ValueError:
             self.fail(f"'{value}' is not a list of numbers such as 5,10,15", param, ctx)
+
+
+def removed_option(name: str, reason: str) -> Callable[[Command], Command]:
+    """A flag that an earlier version had: refused with the reason, in one line."""
+
+    def refuse(ctx: click.Context, param: click.Parameter, value: bool) -> None:
+        if value:
+            raise ConfigError(f"{name}: removed, {reason}; leave it out")
+
+    return click.option(name, is_flag=True, hidden=True, expose_value=False, callback=refuse)
 
 
 FOLDER = click.Path(path_type=Path)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, removed_option, split_option
 
 
 @click.command()
@@ -16,7 +16,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option
 @click.option("--scene", "scenes", multiple=True, type=int, help="Only this sequence; repeat it for more.")
 @click.option("--object", "objects", multiple=True, type=int, help="Only this object; repeat it for more.")
 @click.option("--all-frames", is_flag=True, help="Every annotated pose counts, not only the targets.")
-@click.option("--choi-legacy", is_flag=True, help="Angles as in old tables: unwrapped Euler angles, subtracted.")
+@removed_option("--choi-legacy", "angles are always those of the residual rotation")
 @click.option("--by-axis", is_flag=True, help="The paper's layout: a row for each axis, a column for each file.")
 @click.option(
     "--resamples",
@@ -33,7 +33,6 @@ def tracking(
     scenes: tuple[int, ...],
     objects: tuple[int, ...],
     all_frames: bool,
-    choi_legacy: bool,
     by_axis: bool,
     resamples: int,
     out: tuple[Path, ...],
@@ -72,9 +71,9 @@ def tracking(
         raise ConfigError(f"{opened.root}: none of its targets has this --scene and --object; leave one of them away")
     named = named_tracks(files, tracks)
     if by_axis:
-        table = axis_table(named, choi_legacy=choi_legacy)
+        table = axis_table(named)
     else:
-        table = sequence_table(named, choi_legacy=choi_legacy, resamples=resamples)
+        table = sequence_table(named, resamples=resamples)
     click.echo(markdown(table), nl=False)
     for path in out:
         for written in write_tables(path, [table]):

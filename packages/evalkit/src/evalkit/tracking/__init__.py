@@ -8,7 +8,7 @@ where a tracker that fails is set back to the truth of that frame and goes on fr
 """
 
 from evalkit.tracking.reset_run import ResetRun, Tracker, run_with_resets
-from evalkit.tracking.residuals import Residuals, changes, euler_deg, legacy_angles_deg, residuals
+from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.scores import TRACKING_DEFINITIONS, track_scores
 from evalkit.tracking.tables import TrackedFile, axis_table, named_tracks, sequence_table
 from evalkit.tracking.tracks import Track, frames_of, tracks_of
@@ -24,7 +24,6 @@ __all__ = [
     "changes",
     "euler_deg",
     "frames_of",
-    "legacy_angles_deg",
     "named_tracks",
     "residuals",
     "run_with_resets",

@@ -140,14 +140,3 @@ def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
     return np.asarray(np.rad2deg(np.stack([roll, pitch, yaw], axis=-1)))
-
-
-def legacy_angles_deg(R_est: Float[Array, "n 3 3"], R_gt: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Differences of the unwrapped Euler angles of estimates and truths, degrees, as old tables have them.
-
-    Two rotations that are close can be far apart in these angles, where the pitch is near 90 degrees. The difference in
-    the first frame is brought within half a turn, so that 359 degrees against 1 is 2 degrees.
-    """
-    est, gt = (np.unwrap(euler_deg(se3.nearest_rotation(R)), period=360.0, axis=0) for R in (R_est, R_gt))
-    difference = est - gt
-    return np.asarray(difference - 360.0 * np.round(difference[:1] / 360.0))

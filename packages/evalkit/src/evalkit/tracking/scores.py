@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Bool, Float
 
-from evalkit.tracking.residuals import Residuals, changes, euler_deg, legacy_angles_deg, residuals
+from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.tracks import Track
 
 Array = np.ndarray
@@ -19,8 +19,6 @@ TRACKING_DEFINITIONS: Mapping[str, str] = {
     "the frames with an estimate that the tracker was not given",
     "roll, pitch, yaw": "root mean square of the Euler angles of R_est R_gt^-1 = Rz(yaw) Ry(pitch) Rx(roll), camera "
     "axes: no wrap-around, no gimbal lock near the truth",
-    "Choi legacy": "angles of estimate and truth each turned into Euler angles, unwrapped along the sequence and "
-    "subtracted, as in old tables; the first difference is brought within half a turn; symmetries are left out",
     "5 cm 5°": "share of frames with a distance of origins under 5 cm and a rotation error under 5°; frames without an "
     "estimate fail. With `resets` in the sidecar it is RBOT's protocol: frames in which the tracker was set to the "
     "truth count as failed, but for the first of a sequence, which is not counted",
@@ -33,12 +31,11 @@ TRACKING_DEFINITIONS: Mapping[str, str] = {
 }
 
 
-def track_scores(track: Track, *, choi_legacy: bool = False) -> dict[str, float]:
+def track_scores(track: Track) -> dict[str, float]:
     """Scores of one track, keys with units; NaN where there is nothing to take a mean of.
 
     Args:
         track: at least one frame.
-        choi_legacy: roll, pitch and yaw of `legacy_angles_deg`, and symmetries left out of the RMS.
 
     Returns:
         `frames` (those counted), `lost`, `failed`, `resets` (NaN for a run without), `x_rms_mm` ... `yaw_rms_deg`,
@@ -59,7 +56,7 @@ def track_scores(track: Track, *, choi_legacy: bool = False) -> dict[str, float]
         "resets": float("nan") if track.given is None else float((given & counted).sum()),
         "success_5cm5deg": _mean(tracked[counted].astype(np.float64)),
     }
-    result |= _rms(track, left, own, choi_legacy)
+    result |= _rms(left, own)
     moved_m, turned_rad = changes(track.T_est, track.T_gt, track.info)
     beside = own[1:] & own[:-1] & (np.diff(track.frame) == 1)
     for unit, values in (("mm", 1e3 * moved_m[beside]), ("deg", np.rad2deg(turned_rad[beside]))):
@@ -69,12 +66,8 @@ def track_scores(track: Track, *, choi_legacy: bool = False) -> dict[str, float]
     return result | {"time_ms_mean": _mean(1e3 * track.time_s[timed])}
 
 
-def _rms(track: Track, left: Residuals, own: Bool[Array, " n"], choi_legacy: bool) -> dict[str, float]:
-    if choi_legacy:
-        dt_m = track.T_est[own, :3, 3] - track.T_gt[own, :3, 3]
-        angles = legacy_angles_deg(track.T_est[own, :3, :3], track.T_gt[own, :3, :3])
-    else:
-        dt_m, angles = left.dt_m[own], euler_deg(left.R[own])
+def _rms(left: Residuals, own: Bool[Array, " n"]) -> dict[str, float]:
+    dt_m, angles = left.dt_m[own], euler_deg(left.R[own])
     moved = {f"{axis}_rms_mm": 1e3 * np.sqrt(_mean(dt_m[:, i] ** 2)) for i, axis in enumerate(AXES)}
     turned = {f"{name}_rms_deg": np.sqrt(_mean(angles[:, i] ** 2)) for i, name in enumerate(ANGLES)}
     return {name: float(value) for name, value in (moved | turned).items()}

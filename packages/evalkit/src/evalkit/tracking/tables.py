@@ -56,18 +56,15 @@ def named_tracks(files: Sequence[ResultFile], tracks: Sequence[list[Track]]) -> 
     return [TrackedFile(name=name, tracks=found) for name, found in zip(names, tracks, strict=True)]
 
 
-def sequence_table(
-    tracked: Sequence[TrackedFile], *, choi_legacy: bool = False, resamples: int = 0, seed: int = 0
-) -> Table:
+def sequence_table(tracked: Sequence[TrackedFile], *, resamples: int = 0, seed: int = 0) -> Table:
     """Every sequence, a row for each method, then the mean over sequences (counts summed).
 
     Args:
         tracked: see `named_tracks`.
-        choi_legacy: angles as in old tables, see `legacy_angles_deg`.
         resamples: for 95 % bootstrap intervals of the means, sequences resampled; 0 for none.
         seed: of the resampling.
     """
-    scored = [[track_scores(track, choi_legacy=choi_legacy) for track in item.tracks] for item in tracked]
+    scored = [[track_scores(track) for track in item.tracks] for item in tracked]
     rows: dict[str, list[Row]] = {}
     for item, scores in zip(tracked, scored, strict=True):
         for track, values in zip(item.tracks, scores, strict=True):
@@ -92,7 +89,7 @@ def sequence_table(
             Row(cells={key: cell for key, cell in row.cells.items() if key in shown}, group=row.group, total=row.total)
             for row in [*(row for part in rows.values() for row in part), *totals]
         ],
-        note=_note(tracked, choi_legacy),
+        note=_note(tracked),
         best="column" if method else "",
     )
 
@@ -113,10 +110,8 @@ def _totals(scores: Sequence[Mapping[str, float]], resamples: int, seed: int) ->
     return totals
 
 
-def _note(tracked: Sequence[TrackedFile], choi_legacy: bool) -> str:
+def _note(tracked: Sequence[TrackedFile]) -> str:
     parts = ["RMS over frames with an estimate; lost frames fail 5 cm 5°."]
-    if choi_legacy:
-        parts.append("Roll, pitch, yaw: differences of unwrapped Euler angles, symmetries left out (Choi legacy).")
     free = [item.name for item in tracked if all(track.given is None for track in item.tracks)]
     if free:
         names = "" if len(tracked) == 1 else f" of {', '.join(free)}"
@@ -136,12 +131,12 @@ def _failed_without_reset(track: Track) -> int:
     return 0 if track.given is None else int(scores["failed"] - scores["resets"])
 
 
-def axis_table(tracked: Sequence[TrackedFile], *, choi_legacy: bool = False) -> Table:
+def axis_table(tracked: Sequence[TrackedFile]) -> Table:
     """The layout of the paper's figure 5a: six rows for each sequence, a column for each method, the best bold."""
     found: dict[str, dict[int, dict[str, float]]] = {}
     for place, item in enumerate(tracked):
         for track in item.tracks:
-            found.setdefault(track.name, {})[place] = track_scores(track, choi_legacy=choi_legacy)
+            found.setdefault(track.name, {})[place] = track_scores(track)
     rows = []
     for name, by_method in found.items():
         for shown in RMS_COLUMNS:
@@ -156,6 +151,6 @@ def axis_table(tracked: Sequence[TrackedFile], *, choi_legacy: bool = False) -> 
         name="tracking-axes",
         columns=[TableColumn(key="sequence", heading="sequence"), TableColumn(key="axis", heading="RMS"), *columns],
         rows=rows,
-        note=_note(tracked, choi_legacy),
+        note=_note(tracked),
         best="row",
     )
