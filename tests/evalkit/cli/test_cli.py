@@ -233,7 +233,7 @@ def test_an_error_of_the_system_is_one_line(work, monkeypatch):
     def unreadable(*_, **__):
         raise PermissionError(13, "Permission denied", "test_bop/scene_gt.json")
 
-    monkeypatch.setattr(importlib.import_module("evalkit.report.write"), "write_report", unreadable)
+    monkeypatch.setattr(importlib.import_module("evalkit.report.job"), "make_report", unreadable)
     result = run("report")
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: test_bop/scene_gt.json: no permission")

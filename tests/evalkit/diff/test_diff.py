@@ -13,7 +13,7 @@ from evalkit.cli import main
 from evalkit.diff import COUNTS, MEASURES, Side, Sides, differences, judge, open_sides, parse_rule
 from evalkit.diff.deltas import paired_rows
 from evalkit.diff.rules import OPERATORS, STATISTICS
-from evalkit.report.write import estimates_csv
+from evalkit.report.job import estimates_csv
 from posecore import se3
 from posecore.bop import write_results
 from posecore.errors import ConfigError

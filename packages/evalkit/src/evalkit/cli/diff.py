@@ -76,29 +76,31 @@ def diff(
       numbers of poses                    newly_failed, newly_solved, lost, gained, unpaired
       operators                           < <= > >=
     """
-    from posecore.files import write_atomic
+    from evalkit.diff import DiffJob, compare_files, parse_rule
 
-    from evalkit.diff import differences, judge, open_sides, parse_rule
-    from evalkit.diff.text import csv_text, json_text, text
-
-    parsed = [parse_rule(rule) for rule in rules]
-    named = (result_a, result_b)
-    with open_sides((a, b), results=named, dataset=dataset, split=split, vss=vss, workers=workers) as sides:
-        difference = differences(sides, limit_diameters=limit, resamples=resamples, seed=seed)
-        verdicts = judge(parsed, difference)
-        click.echo(text(difference, listed))
-        if json_file:
-            write_atomic(json_file, json_text(difference, verdicts).encode())
-        if csv_file:
-            write_atomic(csv_file, csv_text(difference).encode())
-        if html_file:
-            from evalkit.diff.page import difference_page
-
-            write_atomic(html_file, difference_page(difference, verdicts, pictures).encode())
-    for file in (json_file, csv_file, html_file):
-        if file:
-            click.echo(f"Written: {file}")
-    for verdict in verdicts:
+    compared = compare_files(
+        DiffJob(
+            paths=(a, b),
+            results=(result_a, result_b),
+            dataset=dataset,
+            split=split,
+            vss=vss,
+            workers=workers,
+            limit_diameters=limit,
+            resamples=resamples,
+            seed=seed,
+            rules=tuple(map(parse_rule, rules)),
+            listed=listed,
+            pictures=pictures,
+            json_file=json_file,
+            csv_file=csv_file,
+            html_file=html_file,
+        )
+    )
+    click.echo(compared.text)
+    for file in compared.written:
+        click.echo(f"Written: {file}")
+    for verdict in compared.verdicts:
         click.echo(f"{'FAILED' if verdict.fired else 'passed'}: {verdict.words}", err=verdict.fired)
-    if any(verdict.fired for verdict in verdicts):
+    if any(verdict.fired for verdict in compared.verdicts):
         raise click.exceptions.Exit(1)

@@ -55,30 +55,24 @@ def perturb(
       evalkit perturb --dataset lmo --out curve.csv --angles 5,10,15,30,45 --translations 0.1,0.5,1
       evalkit perturb --dataset lm --out curve.csv --protocol paper
     """
-    from posecore.bop import BopDataset
-    from posecore.errors import ConfigError
-
     from evalkit.inputs.pairing import Level
-    from evalkit.inputs.perturbation import PROTOCOLS, levels_of, perturb_dataset
+    from evalkit.inputs.perturbation import PROTOCOLS, PerturbJob, write_initial_poses
 
-    if protocol is not None:
-        if angles or translations:
-            raise ConfigError(f"--protocol {protocol} brings its own levels; leave --angles and --translations away")
-        angles, translations = PROTOCOLS[protocol].angles_deg, PROTOCOLS[protocol].translations_diameter
     limit = None
     if random_up_to is not None or random_translation is not None:
         limit = Level(angle_deg=random_up_to or 0.0, translation_diameter=random_translation or 0.0)
-    if depth_stretch != 1 and not random_translation:
-        raise ConfigError("--depth-stretch is for random starts; give --random-translation too")
-    count = perturb_dataset(
-        BopDataset(dataset, split),
-        out,
-        levels=levels_of(angles, translations),
-        seed=seed,
+    job = PerturbJob(
+        dataset=dataset,
+        out=out,
+        split=split,
+        protocol=protocol,
+        angles_deg=angles,
+        translations_diameter=translations,
         random_up_to=limit,
         depth_stretch=depth_stretch,
-        protocol=protocol,
+        seed=seed,
     )
+    count = write_initial_poses(job)
     click.echo(f"{count} start poses: {out}")
     if protocol is not None:
         click.echo(f"Protocol '{protocol}' refines them in {PROTOCOLS[protocol].iterations} iterations.")

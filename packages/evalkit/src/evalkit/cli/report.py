@@ -41,26 +41,21 @@ def report(
       evalkit report
       evalkit report --dataset lmo --results start.csv --results refined.csv --out report
     """
-    from posecore.bop import BopDataset
+    from evalkit.report.job import ReportJob, make_report
 
-    from evalkit.inputs.result_files import dataset_of, find_result_files
-    from evalkit.report.write import write_report
-
-    here = Path()
-    paths = list(results) or find_result_files(here, dataset is not None)
-    opened = BopDataset(dataset or dataset_of(paths, here), split)
+    job = ReportJob(out=out, results=results, dataset=dataset, split=split, vss=vss, worst=worst, workers=workers)
     with _progress() as progress:
 
-        def start(name: str, total: int) -> Callable[[int], None]:
+        def on_file(name: str, total: int) -> Callable[[int], None]:
             task = progress.add_task(name, total=total)
             return lambda done: progress.advance(task, done)
 
-        written = write_report(opened, paths, out, vss=vss, worst=worst, workers=workers, start=start)
-    for item in written.summary["against_start"]:
+        made = make_report(job, on_file)
+    for item in made.summary["against_start"]:
         click.echo(item["words"])
-    for file in written.summary["files"]:
+    for file in made.summary["files"]:
         click.echo(_total_line(file))
-    click.echo(f"Report: {written.page}")
+    click.echo(f"Report: {made.page}")
 
 
 def _progress() -> Progress:

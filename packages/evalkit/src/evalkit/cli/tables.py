@@ -48,18 +48,13 @@ def tables(
       evalkit tables --results start.csv --results contour.csv --results mse.csv --by scene
       evalkit tables --out tables.tex --out tables.csv --resamples 1000
     """
-    from posecore.bop import BopDataset
+    from evalkit.tables.paper import PaperTablesJob, make_paper_tables
+    from evalkit.tables.writers import text_of
 
-    from evalkit.inputs.result_files import dataset_of, find_result_files
-    from evalkit.tables.paper import paper_tables, score_files
-    from evalkit.tables.writers import require_suffixes, text_of, write_tables
-
-    require_suffixes(out)
-    here = Path()
-    paths = list(results) or find_result_files(here, dataset is not None)
-    opened = BopDataset(dataset or dataset_of(paths, here), split)
-    found = paper_tables(score_files(opened, paths, vss, workers=workers), by=by, resamples=resamples)
-    click.echo(text_of(found, ".md"), nl=False)
-    for path in out:
-        for written in write_tables(path, found):
-            click.echo(f"Table: {written}")
+    job = PaperTablesJob(
+        results=results, dataset=dataset, split=split, by=by, vss=vss, workers=workers, resamples=resamples, out=out
+    )
+    made, written = make_paper_tables(job)
+    click.echo(text_of(made, ".md"), nl=False)
+    for path in written:
+        click.echo(f"Table: {path}")

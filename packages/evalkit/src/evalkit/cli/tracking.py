@@ -48,33 +48,21 @@ def tracking(
       evalkit tracking --dataset choi --results track.csv
       evalkit tracking --results ours.csv --results theirs.csv --by-axis --out table.tex --out table.csv
     """
-    from posecore.bop import BopDataset
-    from posecore.errors import ConfigError
-
-    from evalkit.inputs.result_files import dataset_of, load_result_files
     from evalkit.tables.markdown import markdown
-    from evalkit.tables.writers import require_suffixes, write_tables
-    from evalkit.tracking import axis_table, frames_of, named_tracks, sequence_table, tracks_of
+    from evalkit.tracking.job import TrackingJob, make_tracking_table
 
-    require_suffixes(out)
-    opened = BopDataset(dataset or dataset_of(results, Path()), split)
-    files = load_result_files(results, opened)
-    tracks = [
-        [
-            track
-            for track in tracks_of(opened, file, *frames_of(opened, file, all_frames=all_frames))
-            if (not scenes or track.scene_id in scenes) and (not objects or track.obj_id in objects)
-        ]
-        for file in files
-    ]
-    if not any(tracks):
-        raise ConfigError(f"{opened.root}: none of its targets has this --scene and --object; leave one of them away")
-    named = named_tracks(files, tracks)
-    if by_axis:
-        table = axis_table(named)
-    else:
-        table = sequence_table(named, resamples=resamples)
+    job = TrackingJob(
+        results=results,
+        dataset=dataset,
+        split=split,
+        scenes=scenes,
+        objects=objects,
+        all_frames=all_frames,
+        by_axis=by_axis,
+        resamples=resamples,
+        out=out,
+    )
+    table, written = make_tracking_table(job)
     click.echo(markdown(table), nl=False)
-    for path in out:
-        for written in write_tables(path, [table]):
-            click.echo(f"Table: {written}")
+    for path in written:
+        click.echo(f"Table: {path}")

@@ -43,6 +43,64 @@ PROTOCOLS: Mapping[str, Protocol] = {
 """The paper says 5 to 45 degrees and 0 to 1 diameters; the steps of 5 degrees and 0.1 diameters are ours."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class PerturbJob:
+    """A file of initial poses to make.
+
+    Attributes:
+        dataset: BOP folder with ground truth.
+        out: result file to write; its sidecar goes beside it.
+        split: of the dataset.
+        protocol: name of a `PROTOCOLS` entry that gives the levels, None for the two below.
+        angles_deg: one initial pose for each.
+        translations_diameter: one initial pose for each.
+        random_up_to: one more initial pose, its angle and length drawn evenly from 0 up to these; None for none.
+        depth_stretch: factor on the part of the random initial pose's translation along the viewing ray, 1 or more.
+        seed: of all draws.
+    """
+
+    dataset: Path
+    out: Path
+    split: str | None = None
+    protocol: str | None = None
+    angles_deg: tuple[float, ...] = ()
+    translations_diameter: tuple[float, ...] = ()
+    random_up_to: Level | None = None
+    depth_stretch: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.protocol is not None and (self.angles_deg or self.translations_diameter):
+            raise ConfigError(
+                f"--protocol {self.protocol} brings its own levels; leave --angles and --translations away"
+            )
+        if self.depth_stretch != 1 and not (self.random_up_to and self.random_up_to.translation_diameter):
+            raise ConfigError("--depth-stretch is for random starts; give --random-translation too")
+
+    @property
+    def levels(self) -> list[Level]:
+        """Levels of every target."""
+        protocol = PROTOCOLS[self.protocol] if self.protocol is not None else self
+        return levels_of(protocol.angles_deg, protocol.translations_diameter)
+
+
+def write_initial_poses(job: PerturbJob) -> int:
+    """Write the result file of a job and its sidecar; the number of its lines.
+
+    Raises:
+        PoseError: the dataset or the job's levels are not usable; the message names them.
+    """
+    return perturb_dataset(
+        BopDataset(job.dataset, job.split),
+        job.out,
+        levels=job.levels,
+        seed=job.seed,
+        random_up_to=job.random_up_to,
+        depth_stretch=job.depth_stretch,
+        protocol=job.protocol,
+    )
+
+
 def departures(sidecar: Mapping[str, Any]) -> list[str]:
     """In what a result file from perturbed starts departs from their protocol, a sentence each; empty where in nothing.
 

@@ -93,6 +93,24 @@ def dataset_of(paths: Sequence[Path], folder: Path) -> Path:
     return next(iter(named))
 
 
+def open_dataset(
+    results: Sequence[Path], dataset: Path | None = None, split: str | None = None, folder: Path = Path()
+) -> tuple[BopDataset, list[Path]]:
+    """The dataset and the result files of a command.
+
+    Args:
+        results: result files; without any, those of `find_result_files`.
+        dataset: its folder; by default the one that the sidecars name.
+        split: of the dataset.
+        folder: where result files and relative dataset folders are looked for.
+
+    Raises:
+        PoseError: there is no result file or no dataset; the message names what is missing.
+    """
+    paths = list(results) or find_result_files(folder, dataset is not None)
+    return BopDataset(dataset or dataset_of(paths, folder), split), paths
+
+
 def load_result_files(paths: Sequence[Path], dataset: BopDataset) -> list[ResultFile]:
     """Read and check result files: starts come first, the others stay in order.
 

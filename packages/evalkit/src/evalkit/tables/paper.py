@@ -1,6 +1,7 @@
 """The paper's tables from result files: refinement, loss ablation, perturbation curves, whichever the files hold."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from posecore.bop import BopDataset
@@ -8,7 +9,7 @@ from posecore.bop import BopDataset
 from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.perturbation import departures
-from evalkit.inputs.result_files import load_result_files
+from evalkit.inputs.result_files import load_result_files, open_dataset
 from evalkit.scores.convergence import by_level, by_level_and_object
 from evalkit.tables.convergence import level_object_tables, level_tables
 from evalkit.tables.model import Table
@@ -21,6 +22,49 @@ from evalkit.tables.paper_refinement import (
     methods_of,
     score_by_group_table,
 )
+from evalkit.tables.writers import require_suffixes, write_tables
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperTablesJob:
+    """Tables of the paper to make.
+
+    Attributes:
+        results: BOP result files; without any, those with a sidecar in the working folder and its `results/`.
+        dataset: BOP folder with ground truth; by default the one that the sidecars name.
+        split: of the dataset.
+        by: what is counted once in totals and has a row or column of its own.
+        vss: VSS of whole silhouettes or of visible parts.
+        workers: number of processes that score poses; the numbers do not depend on it.
+        resamples: for 95 % bootstrap intervals, 0 for none.
+        seed: of the resampling.
+        out: files to write, .md, .tex, .csv or .json.
+    """
+
+    results: tuple[Path, ...] = ()
+    dataset: Path | None = None
+    split: str | None = None
+    by: By = "object"
+    vss: VssKind = "full"
+    workers: int = 1
+    resamples: int = 0
+    seed: int = 0
+    out: tuple[Path, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_suffixes(self.out)
+
+
+def make_paper_tables(job: PaperTablesJob) -> tuple[list[Table], list[Path]]:
+    """The tables of a job, and the files written.
+
+    Raises:
+        PoseError: a file or the dataset is not usable; the message names it.
+    """
+    dataset, results = open_dataset(job.results, job.dataset, job.split)
+    scored = score_files(dataset, results, job.vss, workers=job.workers)
+    tables = paper_tables(scored, by=job.by, resamples=job.resamples, seed=job.seed)
+    return tables, [written for path in job.out for written in write_tables(path, tables)]
 
 
 def score_files(dataset: BopDataset, paths: Sequence[Path], vss: VssKind = "full", *, workers: int = 1) -> list[Scored]:
@@ -78,14 +122,4 @@ def _curve_tables(methods: Sequence[Method], said: Sequence[str], resamples: int
     objects = {method.name: by_level_and_object(method.table, resamples=resamples, seed=seed) for method in methods}
     several = len({obj_id for found in objects.values() for obj_id in found}) > 1
     tables = level_tables(total) + (level_object_tables(objects) if several else [])
-    return [
-        Table(
-            title=table.title,
-            name=table.name,
-            columns=table.columns,
-            rows=table.rows,
-            note=" ".join([table.note, *said]),
-            best=table.best,
-        )
-        for table in tables
-    ]
+    return [replace(table, note=" ".join([table.note, *said])) for table in tables]

@@ -7,6 +7,7 @@ Approach to Real-Time Monocular Multiple Object Tracking", TPAMI 2018): the shar
 where a tracker that fails is set back to the truth of that frame and goes on from there.
 """
 
+from evalkit.tracking.job import TrackingJob, make_tracking_table
 from evalkit.tracking.reset_run import ResetRun, Tracker, run_with_resets
 from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.scores import TRACKING_DEFINITIONS, track_scores
@@ -20,10 +21,12 @@ __all__ = [
     "Track",
     "TrackedFile",
     "Tracker",
+    "TrackingJob",
     "axis_table",
     "changes",
     "euler_deg",
     "frames_of",
+    "make_tracking_table",
     "named_tracks",
     "residuals",
     "run_with_resets",

@@ -8,25 +8,46 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from posecore.bop import BopDataset
-from posecore.errors import ConfigError
 from posecore.files import write_atomic
 
 from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
-from evalkit.inputs.result_files import load_result_files
+from evalkit.inputs.result_files import load_result_files, open_dataset
 from evalkit.report.page import report_page
 from evalkit.report.summary import summarise
 from evalkit.tables.report_tables import report_tables
 from evalkit.tables.writers import write_tables
 
-Start = Callable[[str, int], Callable[[int], None]]
-"""Announces a result file and its number of poses; returns what is called as they are done."""
+OnFile = Callable[[str, int], Callable[[int], None]]
+"""Called with a result file's name and number of poses; returns what is called with each number of poses done."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportJob:
+    """A report to make.
+
+    Attributes:
+        out: folder, made where it does not exist.
+        results: BOP result files; without any, those with a sidecar in the working folder and its `results/`.
+        dataset: BOP folder with ground truth; by default the one that the sidecars name.
+        split: of the dataset.
+        vss: VSS of whole silhouettes or of visible parts.
+        worst: number of worst cases shown as pictures.
+        workers: number of processes that score poses; the numbers do not depend on it.
+    """
+
+    out: Path = Path("report")
+    results: tuple[Path, ...] = ()
+    dataset: Path | None = None
+    split: str | None = None
+    vss: VssKind = "full"
+    worst: int = 12
+    workers: int = 1
 
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """Where a report was written, and its summary."""
+    """Paths of a report's files, and its summary."""
 
     page: Path
     table: Path
@@ -35,37 +56,23 @@ class Report:
     summary: dict[str, Any]
 
 
-def write_report(
-    dataset: BopDataset,
-    results: Sequence[Path],
-    out: Path,
-    *,
-    vss: VssKind = "full",
-    worst: int = 12,
-    workers: int = 1,
-    start: Start = lambda name, total: lambda done: None,
-) -> Report:
-    """Evaluate result files; write `index.html`, `tables.md`, `tables.tex`, `estimates.csv`, `summary.json` into `out`.
+def make_report(job: ReportJob, on_file: OnFile = lambda name, total: lambda done: None) -> Report:
+    """Evaluate result files; write `index.html`, `tables.md`, `tables.tex`, `estimates.csv` and `summary.json`.
 
     Args:
-        dataset: with ground truth.
-        results: BOP result files; start poses are known by `method: start` in their sidecar.
-        out: folder, made where it does not exist.
-        vss: whole silhouettes or visible parts.
-        worst: number of worst cases to show as pictures.
-        workers: number of processes that score poses.
-        start: progress, see `Start`.
+        job: what is evaluated, and where it is written.
+        on_file: progress, see `OnFile`.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
     """
-    if not results:
-        raise ConfigError("no result files: name them with --results FILE.csv")
+    dataset, results = open_dataset(job.results, job.dataset, job.split)
     files = load_result_files(results, dataset)
-    with Evaluator(dataset, vss, workers=workers) as evaluator:
-        scored = [score_file(evaluator, file, partial(start, file.name)) for file in files]
-        summary = summarise(dataset, scored, vss)
-        page = report_page(evaluator, scored, summary, worst)
+    with Evaluator(dataset, job.vss, workers=job.workers) as evaluator:
+        scored = [score_file(evaluator, file, partial(on_file, file.name)) for file in files]
+        summary = summarise(dataset, scored, job.vss)
+        page = report_page(evaluator, scored, summary, job.worst)
+    out = job.out
     written = Report(
         page=out / "index.html",
         table=out / "estimates.csv",
