@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from evalkit.evaluation.evaluator import Evaluator
-from evalkit.inputs.pairing import Pair, pair_up
+from evalkit.inputs.pairing import MatchedPose, pair_up
 from evalkit.inputs.result_files import load_result_files
 from evalkit.pose_errors import metrics
 from evalkit.pose_errors.nearest_points import NearestPoints
@@ -68,7 +68,7 @@ def main() -> None:
     print(json.dumps(result))
 
 
-def many(dataset: BopDataset, pairs: Sequence[Pair], count: int, workers: int) -> dict[str, object]:
+def many(dataset: BopDataset, pairs: Sequence[MatchedPose], count: int, workers: int) -> dict[str, object]:
     """Score many estimates; what it took, and the peaks of memory of this process and of its largest worker."""
     result: dict[str, object] = {
         "benchmark": "eval_speed_synthetic",
@@ -78,7 +78,7 @@ def many(dataset: BopDataset, pairs: Sequence[Pair], count: int, workers: int) -
     }
     with Evaluator(dataset, with_vsd=False, workers=workers) as evaluator:
         for name, n in (("tenth", count // 10), ("all", count)):
-            drawn = near_truths(pairs, n)
+            drawn = near_ground_truth(pairs, n)
             began = time.monotonic()
             table = evaluator.evaluate(drawn)
             print(f"{len(table)} estimates in {time.monotonic() - began:.0f} s")
@@ -89,14 +89,14 @@ def many(dataset: BopDataset, pairs: Sequence[Pair], count: int, workers: int) -
     return result
 
 
-def near_truths(pairs: Sequence[Pair], count: int) -> list[Pair]:
+def near_ground_truth(pairs: Sequence[MatchedPose], count: int) -> list[MatchedPose]:
     """Estimates up to 20 degrees and 3 cm from the truths, taken in turn."""
     rng = np.random.default_rng(0)
     drawn = []
     for index in range(count):
         pair = pairs[index % len(pairs)]
         assert pair.estimate is not None
-        pose = se3.perturb(pair.truth.T_cam_obj, rng.uniform(0, 0.35), rng.uniform(0, 0.03), rng)
+        pose = se3.perturb(pair.gt.T_cam_obj, rng.uniform(0, 0.35), rng.uniform(0, 0.03), rng)
         drawn.append(replace(pair, estimate=replace(pair.estimate, T_cam_obj=pose)))
     return drawn
 
@@ -106,28 +106,32 @@ def peak_mb(who: int) -> float:
     return round(resource.getrusage(who).ru_maxrss / 1e3, 1)
 
 
-def functions(dataset: BopDataset, evaluator: Evaluator, pairs: Sequence[Pair]) -> dict[str, Callable[[], object]]:
+def functions(
+    dataset: BopDataset, evaluator: Evaluator, pairs: Sequence[MatchedPose]
+) -> dict[str, Callable[[], object]]:
     """Each error over all pairs by itself, an object's together."""
-    by_object: dict[int, list[Pair]] = {}
+    by_object: dict[int, list[MatchedPose]] = {}
     for pair in pairs:
-        by_object.setdefault(pair.truth.obj_id, []).append(pair)
+        by_object.setdefault(pair.gt.obj_id, []).append(pair)
     cases = [
         (
-            np.stack([pair.estimate.T_cam_obj for pair in found if pair.estimate is not None]),
-            np.stack([pair.truth.T_cam_obj for pair in found]),
+            np.stack([pair.estimate.T_cam_obj for pair in of_object if pair.estimate is not None]),
+            np.stack([pair.gt.T_cam_obj for pair in of_object]),
             evaluator.mesh(obj_id).vertices_m,
             symmetry_transforms(dataset.models_info[obj_id]),
-            np.stack([evaluator.camera(pair.scene_id, pair.im_id).K for pair in found]),
+            np.stack([evaluator.camera(pair.scene_id, pair.im_id).K for pair in of_object]),
         )
-        for obj_id, found in by_object.items()
+        for obj_id, of_object in by_object.items()
     ]
     nearest = [NearestPoints(points) for _, _, points, _, _ in cases]
     return {
         "add": lambda: [metrics.add(est, gt, points) for est, gt, points, _, _ in cases],
         "adi": lambda: [metrics.adi(est, gt, near) for (est, gt, *_), near in zip(cases, nearest, strict=True)],
-        "mssd_all_vertices": lambda: [metrics.mssd(est, gt, points, turns) for est, gt, points, turns, _ in cases],
+        "mssd_all_vertices": lambda: [
+            metrics.mssd(est, gt, points, transforms) for est, gt, points, transforms, _ in cases
+        ],
         "mspd_and_proj": lambda: [
-            metrics.projection_errors(est, gt, K, points, turns) for est, gt, points, turns, K in cases
+            metrics.projection_errors(est, gt, K, points, transforms) for est, gt, points, transforms, K in cases
         ],
         "re_and_te": lambda: [(metrics.re(est, gt), metrics.te(est, gt)) for est, gt, _, _, _ in cases],
     }

@@ -120,8 +120,11 @@ def test_newly_failed_come_with_the_largest_changes_first(tmp_path):
 
 
 def test_poses_are_paired_by_instance_and_start_whatever_their_order(tmp_path):
-    starts = {"start_angle_deg": [5.0, 10.0, 5.0, NAN, NAN], "start_translation_diameter": [0.0, 0.0, 0.0, NAN, NAN]}
-    a = errors_table(5, im_id=[0, 0, 1, 1, 1], vss=[0.1, 0.2, 0.3, 0.4, 0.5], **starts)
+    initial_poses = {
+        "initial_angle_deg": [5.0, 10.0, 5.0, NAN, NAN],
+        "initial_translation_diameter": [0.0, 0.0, 0.0, NAN, NAN],
+    }
+    a = errors_table(5, im_id=[0, 0, 1, 1, 1], vss=[0.1, 0.2, 0.3, 0.4, 0.5], **initial_poses)
     b = a.iloc[[2, 0, 3, 1, 4]].reset_index(drop=True)
     rows_a, rows_b = paired_rows(a, b)
     np.testing.assert_array_equal(a.vss.to_numpy()[rows_a], b.vss.to_numpy()[rows_b])
@@ -346,7 +349,7 @@ def test_result_files_are_evaluated_and_shown(results, tmp_path):
 
 def test_the_order_of_the_files_is_kept_also_where_the_second_holds_start_poses(dataset, perfect, tmp_path):
     write_results(tmp_path / "refined.csv", perfect, {"dataset": str(dataset.root)})
-    write_results(tmp_path / "start.csv", perfect[:-1], {"dataset": str(dataset.root), "method": "start"})
+    write_results(tmp_path / "start.csv", perfect[:-1], {"dataset": str(dataset.root), "method": "initial"})
     with open_sides((tmp_path / "refined.csv", tmp_path / "start.csv")) as both:
         assert (both.a.name, both.b.name) == ("refined", "start")
 

@@ -152,7 +152,7 @@ def test_intervals_of_totals_resample_whole_scenes():
 
 def test_names_come_from_sidecars():
     files = [
-        file("init", method="start"),
+        file("init", method="initial"),
         file("a", method="refinenet", loss="contour"),
         file("b", method="refinenet", settings={"loss": "mse"}),
         file("c"),

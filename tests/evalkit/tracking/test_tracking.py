@@ -46,7 +46,7 @@ def off(T_gt, R=None, t_m=(0.0, 0.0, 0.0)):
     return se3.apply_update(T_gt, np.broadcast_to(R, (len(T_gt), 3, 3)), np.broadcast_to(np.array(t_m), (len(T_gt), 3)))
 
 
-def track(T_est, T_gt, info=None, given=None, frame=None, time_s=None, name="scene 1, object 5"):
+def track(T_est, T_gt, info=None, was_initialised=None, frame=None, time_s=None, name="scene 1, object 5"):
     n = len(T_gt)
     return Track(
         scene_id=1,
@@ -58,7 +58,7 @@ def track(T_est, T_gt, info=None, given=None, frame=None, time_s=None, name="sce
         T_est=np.array(T_est, np.float64),
         T_gt=T_gt,
         time_s=np.full(n, -1.0) if time_s is None else np.array(time_s, np.float64),
-        given=None if given is None else np.array(given, bool),
+        was_initialised=None if was_initialised is None else np.array(was_initialised, bool),
         info=info,
     )
 
@@ -280,7 +280,7 @@ def test_given_frames_are_not_scored_and_count_as_failures_but_for_the_first():
     T_est = off(T_gt, None, (0.001, 0, 0))
     T_est[3] = T_gt[3]  # a file may hold the pose that was given ...
     T_est[0, 0, 3] += 1.0  # ... or anything else
-    scores = track_scores(track(T_est, T_gt, given=[True, False, False, True, False, False]))
+    scores = track_scores(track(T_est, T_gt, was_initialised=[True, False, False, True, False, False]))
     assert (scores["frames"], scores["failed"], scores["resets"]) == (5.0, 1.0, 1.0)
     assert scores["success_5cm5deg"] == pytest.approx(0.8)
     assert scores["x_rms_mm"] == pytest.approx(1.0)
@@ -290,7 +290,7 @@ def test_given_frames_are_not_scored_and_count_as_failures_but_for_the_first():
 def test_a_run_without_resets_has_none_rather_than_zero():
     T_gt = moving(3)
     assert np.isnan(track_scores(track(T_gt, T_gt))["resets"])
-    assert track_scores(track(T_gt, T_gt, given=[True, False, False]))["resets"] == 0.0
+    assert track_scores(track(T_gt, T_gt, was_initialised=[True, False, False]))["resets"] == 0.0
 
 
 def test_time_is_the_mean_of_the_known_ones():
@@ -302,24 +302,24 @@ def test_time_is_the_mean_of_the_known_ones():
 class FakeTracker:
     """Follows the truth perfectly but fails in chosen frames, and remembers where it was set to the truth."""
 
-    def __init__(self, truths, fails):
-        self.truths, self.fails, self.set_at = truths, fails, []
+    def __init__(self, T_gt, fails):
+        self.T_gt, self.fails, self.set_at = T_gt, fails, []
 
     def initialise(self, frame, T_cam_obj):
-        np.testing.assert_array_equal(T_cam_obj, self.truths[frame])
+        np.testing.assert_array_equal(T_cam_obj, self.T_gt[frame])
         self.set_at.append(frame)
 
     def track(self, frame):
-        return self.fails.get(frame, self.truths[frame])
+        return self.fails.get(frame, self.T_gt[frame])
 
 
 def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
-    truths = moving(10)
-    fails = {3: se3.apply_update(truths[3], about(X, 6.0), np.zeros(3)), 7: None}
-    tracker = FakeTracker(truths, fails)
-    run = run_with_resets(tracker, iter(range(10)), truths)
+    T_gt = moving(10)
+    fails = {3: se3.apply_update(T_gt[3], about(X, 6.0), np.zeros(3)), 7: None}
+    tracker = FakeTracker(T_gt, fails)
+    run = run_with_resets(tracker, iter(range(10)), T_gt)
     assert tracker.set_at == [0, 3, 7]
-    assert np.flatnonzero(run.given).tolist() == [0, 3, 7]
+    assert np.flatnonzero(run.was_initialised).tolist() == [0, 3, 7]
     assert run.success == pytest.approx(7 / 9)
     np.testing.assert_array_equal(run.T_est[3], fails[3])
     assert np.isnan(run.T_est[[0, 7]]).all()
@@ -327,9 +327,9 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
 
 
 def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
-    truths = moving(10)
-    run = run_with_resets(FakeTracker(truths, {4: None, 5: None}), range(10), truths)
-    scores = track_scores(track(run.T_est, truths, given=run.given))
+    T_gt = moving(10)
+    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt)
+    scores = track_scores(track(run.T_est, T_gt, was_initialised=run.was_initialised))
     assert scores["success_5cm5deg"] == pytest.approx(run.success) == pytest.approx(7 / 9)
     assert (scores["resets"], scores["failed"]) == (2.0, 2.0)
     assert run.resets(2, 5, range(100, 110)) == [
@@ -338,21 +338,21 @@ def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
 
 
 def test_a_symmetric_copy_is_no_failure():
-    truths = moving(4)
-    copies = {frame: truths[frame] @ half_turn(Z) for frame in range(4)}
-    assert run_with_resets(FakeTracker(truths, copies), range(4), truths, info=symmetric(half_turn(Z))).success == 1.0
-    assert run_with_resets(FakeTracker(truths, copies), range(4), truths).success == 0.0
+    T_gt = moving(4)
+    copies = {frame: T_gt[frame] @ half_turn(Z) for frame in range(4)}
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, info=symmetric(half_turn(Z))).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt).success == 0.0
 
 
 def test_sequences_that_cannot_be_tracked_are_refused():
-    truths = moving(3)
+    T_gt = moving(3)
     with pytest.raises(ConfigError, match="without frames"):
-        run_with_resets(FakeTracker(truths, {}), [], [])
-    truths[1] = np.nan
+        run_with_resets(FakeTracker(T_gt, {}), [], [])
+    T_gt[1] = np.nan
     with pytest.raises(ConfigError, match="frame 1 has no true pose"):
-        run_with_resets(FakeTracker(truths, {}), range(3), truths)
+        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt)
     with pytest.raises(ValueError, match="zip"):
-        run_with_resets(FakeTracker(truths, {}), range(1), truths)
+        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt)
 
 
 def two_sequences(t_m, **rest):
@@ -395,7 +395,7 @@ def test_means_of_sequences_have_intervals_where_asked_for():
 
 def test_failures_without_a_reset_are_said():
     T_gt = moving(5)
-    broken = track(lost(T_gt, 2), T_gt, given=[True, False, False, False, False])
+    broken = track(lost(T_gt, 2), T_gt, was_initialised=[True, False, False, False, False])
     note = sequence_table([TrackedFile(name="a", tracks=[broken])]).note
     assert "a: 1 failed frames without a reset, so RBOT's protocol was not kept" in note
     assert "not RBOT's number" not in note

@@ -183,7 +183,7 @@ def test_perturbed_starts_are_no_sequence(sequence, tmp_path):
     (file,) = load_result_files([tmp_path / "r.csv"], dataset)
     table, T_est, T_gt = frames_of(dataset, file)
     table.loc[1, ["im_id", "obj_id", "gt_index"]] = table.loc[0, ["im_id", "obj_id", "gt_index"]]
-    with pytest.raises(ResultFileError, match="has several poses of one instance"):
+    with pytest.raises(ResultFileError, match="has several poses of an instance"):
         tracks_of(dataset, file, table, T_est, T_gt)
 
 

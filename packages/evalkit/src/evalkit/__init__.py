@@ -18,7 +18,7 @@ _MODULES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Public names, imported on first use: a command that needs none of them starts at once."""
+    """Public names, imported on first use, so that commands start without them."""
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module 'evalkit' has no attribute '{name}'")

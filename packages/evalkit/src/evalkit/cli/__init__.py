@@ -16,13 +16,13 @@ from evalkit.cli.tracking import tracking
 
 @click.group(cls=CleanGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="evalkit")
-@click.option("-v", "--verbose", is_flag=True, help="Log what is read and rendered.")
+@click.option("-v", "--verbose", is_flag=True, help="Log details to stderr.")
 def main(verbose: bool) -> None:
     """Measure 6D poses against BOP ground truth.
 
     \b
     Examples:
-      evalkit perturb --dataset lmo --out results/start.csv --random-up-to 20
+      evalkit perturb --dataset lmo --out results/initial.csv --random-up-to 20
       evalkit report
     """
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")

@@ -22,17 +22,19 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
     type=click.FloatRange(0, min_open=True),
     default=0.1,
     show_default=True,
-    help="A pose fails with an ADD(-S) of so many diameters or more.",
+    help="Smallest ADD(-S) of a failed pose, diameters.",
 )
 @click.option(
-    "--fail-if", "rules", multiple=True, metavar="RULE", help="End with exit code 1 if this is so; may be repeated."
+    "--fail-if", "rules", multiple=True, metavar="RULE", help="Exit with code 1 if the rule holds. Repeatable."
 )
-@click.option("--result-a", metavar="NAME", help="Result file meant in A, where A is the estimates.csv of several.")
+@click.option("--result-a", metavar="NAME", help="Name of the result file in A, if A is the estimates.csv of several.")
 @click.option("--result-b", metavar="NAME", help="The same for B.")
-@click.option("--json", "json_file", type=NEW_FILE, help="Write everything as JSON.")
+@click.option("--json", "json_file", type=NEW_FILE, help="Write the comparison as JSON.")
 @click.option("--csv", "csv_file", type=NEW_FILE, help="Write a line for each pose.")
 @click.option("--html", "html_file", type=NEW_FILE, help="Write a page with pictures.")
-@click.option("--list", "listed", type=click.IntRange(0), default=10, show_default=True, help="Poses to list.")
+@click.option(
+    "--list", "listed", type=click.IntRange(0), default=10, show_default=True, help="Poses to list of each kind."
+)
 @click.option("--pictures", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of each kind.")
 @click.option("--resamples", type=click.IntRange(1), default=1000, show_default=True, help="Of the bootstrap.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")
@@ -55,22 +57,21 @@ def diff(
     resamples: int,
     seed: int,
 ) -> None:
-    """Compare result file B with A, pose by pose: deltas with 95 % intervals, what newly fails, what is newly solved.
+    """Compare result file B with A, pose by pose: deltas with 95 % intervals, newly failed and solved ones.
 
-    A and B are BOP result files, or tables of errors (estimates.csv) that `evalkit report` wrote, which need no
-    dataset.
+    A and B are BOP result files, or error tables (estimates.csv) of `evalkit report`, which need no dataset.
 
     \b
     Examples:
       evalkit diff old.csv new.csv --dataset lmo --html diff.html
       evalkit diff old.csv new.csv --fail-if "vss < -0.01" --fail-if "lower(recall) < -0.02"
-      evalkit diff report/estimates.csv report/estimates.csv --result-a start --result-b refined
+      evalkit diff report/estimates.csv report/estimates.csv --result-a initial --result-b refined
 
     \b
     Rules of --fail-if:
       NAME OPERATOR NUMBER                compares the mean delta, B minus A
       STATISTIC(NAME) OPERATOR NUMBER     mean, median, lower or upper (end of the 95 % interval of the mean)
-      shares, as fractions                vss, recall, auc, ar_mssd, ar_mspd
+      fractions                           vss, recall, auc, ar_mssd, ar_mspd
       errors, mm                          add, adi, add_s, mssd, te, tx, ty, tz
       errors, px and deg                  mspd, proj; re, re_sym
       numbers of poses                    newly_failed, newly_solved, lost, gained, unpaired

@@ -1,4 +1,4 @@
-"""What several commands have in common."""
+"""Option types and options shared by commands."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -50,5 +50,5 @@ workers_option = click.option(
     type=click.IntRange(1),
     default=1,
     show_default=True,
-    help="Processes that score poses; the numbers do not depend on it.",
+    help="Processes that score poses; the results do not depend on it.",
 )

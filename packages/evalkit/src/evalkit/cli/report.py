@@ -30,16 +30,16 @@ def report(
     workers: int,
     worst: int,
 ) -> None:
-    """Write a report: one HTML page, its tables for papers, a CSV line for each pose, a JSON summary.
+    """Write a report: HTML page, tables for papers, CSV with a line for each pose, JSON summary.
 
-    Without options, it takes the result files (*.csv with *.csv.json beside it) in this folder and in results/, and
-    the dataset that their sidecars name. The folder then holds index.html (everything, in one file that opens
-    offline), tables.md and tables.tex, estimates.csv and summary.json.
+    Without options, the result files are those with a sidecar (*.csv.json) in this folder and in results/, and the
+    dataset is the one that the sidecars name. The report folder holds index.html (one file, readable offline),
+    tables.md, tables.tex, estimates.csv and summary.json.
 
     \b
     Examples:
       evalkit report
-      evalkit report --dataset lmo --results start.csv --results refined.csv --out report
+      evalkit report --dataset lmo --results initial.csv --results refined.csv --out report
     """
     from evalkit.report.job import ReportJob, make_report
 
@@ -51,7 +51,7 @@ def report(
             return lambda done: progress.advance(task, done)
 
         made = make_report(job, on_file)
-    for item in made.summary["against_start"]:
+    for item in made.summary["against_initial"]:
         click.echo(item["words"])
     for file in made.summary["files"]:
         click.echo(_total_line(file))

@@ -19,7 +19,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, work
     type=click.Choice(["object", "scene"]),
     default="object",
     show_default=True,
-    help="What has a row of its own and is counted once in totals.",
+    help="Group with a row of its own, counted once in totals.",
 )
 @vss_option
 @workers_option
@@ -37,15 +37,15 @@ def tables(
     resamples: int,
     out: tuple[Path, ...],
 ) -> None:
-    """Print the tables of the 2018 paper for these result files: start poses, refined ones, several methods.
+    """Print the tables of the 2018 paper: initial poses, refined poses, several methods.
 
     Rotation and translation errors and ADD recall, VSS of every object, each object before and after, losses side by
-    side; for starts perturbed by steps the curves. Totals are means over objects, as in the paper. Methods are named
-    by `method` and `loss` in the sidecars.
+    side; for initial poses perturbed by steps the curves. Totals are means over objects, as in the paper. Names of
+    methods are `method` and `loss` of the sidecars.
 
     \b
     Examples:
-      evalkit tables --results start.csv --results contour.csv --results mse.csv --by scene
+      evalkit tables --results initial.csv --results contour.csv --results mse.csv --by scene
       evalkit tables --out tables.tex --out tables.csv --resamples 1000
     """
     from evalkit.tables.paper import PaperTablesJob, make_paper_tables

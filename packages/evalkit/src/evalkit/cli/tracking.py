@@ -13,9 +13,9 @@ from evalkit.cli.options import FOLDER, NEW_FILE, removed_option, split_option
     "--results", multiple=True, required=True, type=FOLDER, help="Result file of a tracker; repeat it to compare."
 )
 @split_option
-@click.option("--scene", "scenes", multiple=True, type=int, help="Only this sequence; repeat it for more.")
-@click.option("--object", "objects", multiple=True, type=int, help="Only this object; repeat it for more.")
-@click.option("--all-frames", is_flag=True, help="Every annotated pose counts, not only the targets.")
+@click.option("--scene", "scenes", multiple=True, type=int, help="Only this sequence. Repeatable.")
+@click.option("--object", "objects", multiple=True, type=int, help="Only this object. Repeatable.")
+@click.option("--all-frames", is_flag=True, help="Score every annotated pose, not only the targets.")
 @removed_option("--choi-legacy", "angles are always those of the residual rotation")
 @click.option("--by-axis", is_flag=True, help="The paper's layout: a row for each axis, a column for each file.")
 @click.option(
@@ -39,8 +39,8 @@ def tracking(
 ) -> None:
     """Score tracked sequences: RMS by axis, frames within 5 cm and 5 degrees, jitter, lost frames, time.
 
-    A scene of the dataset is a sequence, its images in rising order the frames. Where a tracker was set back to the
-    truth after failures (RBOT's protocol), the result file's sidecar says so as
+    A scene of the dataset is a sequence, its images in rising order the frames. For a tracker that was reset
+    to the ground truth after failures (RBOT's protocol), the result file's sidecar lists these frames as
     "resets": [{"scene_id": 1, "im_id": 0, "obj_id": 5}, ...], the first frame of each sequence included.
 
     \b

@@ -1,4 +1,4 @@
-"""Two files compared by rules: text, JSON, CSV and a page."""
+"""Comparison of two files: text, JSON, CSV, page, and verdicts on rules."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class DiffJob:
 
     Attributes:
         paths: the two files, each a BOP result file or an `estimates.csv` of a report.
-        results: result file meant in each, where an `estimates.csv` holds several.
+        results: names of the result files within an `estimates.csv` that holds several.
         dataset: BOP folder with ground truth; by default the one that the sidecars name.
         split: of the dataset.
         vss: VSS of whole silhouettes or of visible parts.
@@ -33,9 +33,9 @@ class DiffJob:
         rules: for continuous integration, see `parse_rule`.
         listed: number of poses that the text lists of each kind.
         pictures: number of pictures of each kind on the page.
-        json_file: everything as JSON, None for no file.
-        csv_file: a line for each pose, None for no file.
-        html_file: a page with pictures, None for no file.
+        json_file: output as JSON, None for no file.
+        csv_file: output with a line for each pose, None for no file.
+        html_file: output as a page with pictures, None for no file.
     """
 
     paths: tuple[Path, Path]
@@ -57,7 +57,7 @@ class DiffJob:
 
 @dataclass(frozen=True, kw_only=True)
 class DiffResult:
-    """What a comparison gave: its text, the verdict on each rule, and the files written."""
+    """Result of a comparison: text, verdicts on the rules, and files written."""
 
     text: str
     verdicts: list[Verdict]
@@ -65,7 +65,7 @@ class DiffResult:
 
 
 def compare_files(job: DiffJob) -> DiffResult:
-    """Compare the two files of a job and write what it asks for.
+    """Compare the two files of a job and write its output files.
 
     Raises:
         PoseError: a file or the dataset is not usable, or no expected pose is in both files; the message names it.

@@ -1,4 +1,4 @@
-"""A report folder: one HTML page, its tables as Markdown and LaTeX, one CSV line for each pose, one JSON summary."""
+"""A report folder: HTML page, tables as Markdown and LaTeX, CSV with a line for each pose, JSON summary."""
 
 import json
 from collections.abc import Callable, Sequence

@@ -13,16 +13,16 @@ LATEX = {
     **{"α": r"\ensuremath{\alpha}", "β": r"\ensuremath{\beta}", "γ": r"\ensuremath{\gamma}"},
     **{"τ": r"\ensuremath{\tau}", "∞": r"\ensuremath{\infty}", "≤": r"\ensuremath{\le}", "≥": r"\ensuremath{\ge}"},
 }
-"""What LaTeX would not show as it is. Other letters are left to its UTF-8 input."""
+"""Escapes of characters that LaTeX would not show. Other letters are left to its UTF-8 input."""
 
 
 def latex_text(text: str) -> str:
-    """Text with everything escaped that LaTeX gives a meaning."""
+    """Text with all special characters of LaTeX escaped."""
     return "".join(LATEX.get(char, char) for char in BLANKS.sub(" ", text))
 
 
 def latex(table: Table, label: str = "") -> str:
-    """The table as a LaTeX float. It needs `\\usepackage{booktabs}`, which the first line says.
+    """The table as a LaTeX float. It needs `\\usepackage{booktabs}`, as its first line notes.
 
     Args:
         table: with title as caption; the note follows in the caption.

@@ -39,7 +39,7 @@ def _padded(texts: Sequence[str], widths: Sequence[int], right: Sequence[bool]) 
 
 
 def _markdown_text(text: str) -> str:
-    """Text that Markdown shows as it is; what needs no escape where it stands is left readable."""
+    """Text with Markdown's special characters escaped, but only where they have an effect."""
     text = re.sub(r"([\\`*|<>~])", r"\\\1", BLANKS.sub(" ", text))
     text = re.sub(r"(?<![^\W_])_|_(?![^\W_])", r"\\_", text)
     return re.sub(r"&(?=#?\w+;)|\](?=[(\[:])", r"\\\g<0>", text)

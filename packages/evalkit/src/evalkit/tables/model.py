@@ -10,7 +10,7 @@ Better = Literal["higher", "lower", ""]
 BLANKS = re.compile(r"[ \t\r\n]+")
 """Runs of blanks, which every text format shows as one space."""
 NOTHING = "–"
-"""What stands in a cell without a value."""
+"""Text of a cell without a value."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +30,14 @@ class TableColumn:
     """A column.
 
     Attributes:
-        key: its name in CSV and JSON and in `Row.cells`, unique in the table; a number's key ends in its unit.
-        heading: what readers see above it, without the unit.
+        key: name in CSV and JSON and in `Row.cells`, unique in the table; a number's key ends in its unit.
+        heading: above the column, without the unit.
         group: heading that neighbouring columns share, empty for none.
-        unit: written after the heading. "%": the values are shares from 0 to 1 and are shown times 100; CSV and JSON
-            keep the shares.
+        unit: written after the heading. "%": the values are fractions from 0 to 1 and are shown times 100; CSV and
+            JSON keep the fractions.
         digits: shown after the decimal point; None for text, which is set flush left.
-        better: which values are good. The best ones of a comparison are set bold; "" where nothing is compared.
-        about: what is measured, in words, for a tooltip.
+        better: order of the values. The best ones of a comparison are set bold; "" where nothing is compared.
+        about: description for a tooltip.
     """
 
     key: str
@@ -60,8 +60,8 @@ class Row:
 
     Attributes:
         cells: value by column key; a key that is absent is an empty cell, as are None and NaN.
-        group: rows with the same one stand in a block, and the best of a column is sought within it.
-        total: whether it sums up the rows above; totals are compared with totals only.
+        group: block of rows, within which the best value of a column is set bold.
+        total: whether the row summarises the rows above; totals are compared with totals only.
     """
 
     cells: Mapping[str, Cell]
@@ -74,13 +74,13 @@ class Table:
     """A table.
 
     Attributes:
-        title: what it shows.
+        title: caption.
         name: short name for files and anchors, lower case with hyphens.
         columns: left to right.
         rows: top to bottom.
-        note: what a reader must know: how values are defined, what was left out.
-        best: where the best value is sought: down each "column" (methods are rows), along each "row" (methods are
-            columns), or nowhere.
+        note: definitions and omissions, below the table.
+        best: direction of the comparison: down each "column" (methods are rows), along each "row" (methods are
+            columns), or none.
     """
 
     title: str
@@ -99,7 +99,7 @@ class Table:
 
 
 def cell_text(column: TableColumn, cell: Cell) -> str:
-    """A cell as readers see it: rounded, an interval as `12.3 [11.9, 12.8]`, `NOTHING` where there is no value."""
+    """A cell as it is shown: rounded, an interval as `12.3 [11.9, 12.8]`, `NOTHING` where there is no value."""
     if isinstance(cell, str):
         return cell
     if isinstance(cell, Interval):
@@ -117,7 +117,7 @@ def _number(column: TableColumn, value: float) -> str:
 
 
 def number_of(cell: Cell) -> float | None:
-    """The number that a cell is sorted and compared by; None for text and empty cells."""
+    """The number of a cell, for sorting and comparison; None for text and empty cells."""
     value = cell.value if isinstance(cell, Interval) else cell
     if value is None or isinstance(value, str) or math.isnan(value):
         return None
@@ -127,15 +127,15 @@ def number_of(cell: Cell) -> float | None:
 def best_cells(table: Table) -> set[tuple[int, str]]:
     """Row number and column key of the cells to set bold: the best ones, all that show the same rounded number.
 
-    A comparison needs two values at least. Down a column, rows of one group are compared, totals apart; along a row,
-    the columns that say what is better.
+    A comparison needs two values at least. Down a column, rows of the same group are compared, totals separately; along a
+    row, the columns with a `better` value.
     """
     compared: dict[Any, list[tuple[int, TableColumn]]] = {}
     for index, row in enumerate(table.rows):
         for column in table.columns:
             if table.best and column.better and number_of(row.cells.get(column.key)) is not None:
-                place = index if table.best == "row" else (row.group, row.total, column.key)
-                compared.setdefault(place, []).append((index, column))
+                compared_key = index if table.best == "row" else (row.group, row.total, column.key)
+                compared.setdefault(compared_key, []).append((index, column))
     best: set[tuple[int, str]] = set()
     for members in compared.values():
         if len(members) > 1:
@@ -155,7 +155,7 @@ def _best_of(table: Table, members: Sequence[tuple[int, TableColumn]]) -> set[tu
 
 
 def column_groups(columns: Sequence[TableColumn]) -> list[tuple[str, int]]:
-    """Neighbouring columns with the same group heading: the heading and how many they are."""
+    """Neighbouring columns with the same group heading: the heading and their number."""
     groups: list[tuple[str, int]] = []
     for column in columns:
         if groups and groups[-1][0] == column.group:

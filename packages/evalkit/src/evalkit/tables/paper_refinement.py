@@ -37,19 +37,19 @@ class Method:
     Attributes:
         name: for tables.
         table: errors.
-        is_start: whether these are the poses that the other methods started from.
+        is_initial: whether these are the initial poses of the other methods.
     """
 
     name: str
     table: pd.DataFrame
-    is_start: bool = False
+    is_initial: bool = False
 
 
 def methods_of(scored: Sequence[Scored]) -> list[Method]:
     """Result files as methods, named by their sidecars."""
     names = method_names([item.file for item in scored])
     return [
-        Method(name=name, table=item.table, is_start=item.file.is_start)
+        Method(name=name, table=item.table, is_initial=item.file.is_initial)
         for name, item in zip(names, scored, strict=True)
     ]
 
@@ -85,7 +85,7 @@ def before_after_table(methods: Sequence[Method], *, by: By = "object", resample
 
     Args:
         methods: initial poses first, see `methods_of`.
-        by: what a block of rows is about.
+        by: group of a block of rows.
         resamples: for 95 % bootstrap intervals, 0 for none.
         seed: of the resampling.
     """
@@ -117,7 +117,7 @@ def error_table(
     Args:
         methods: initial poses first.
         mean_over: whether objects or poses are counted once, see the module.
-        by: what a group is.
+        by: kind of the groups.
         resamples: for 95 % bootstrap intervals, 0 for none.
         seed: of the resampling.
     """
@@ -148,8 +148,8 @@ def score_by_group_table(
     Args:
         methods: initial poses first.
         score: key of a score, one of `ERROR_COLUMNS`.
-        mean_over: what the total counts once, see the module.
-        by: what a column is about.
+        mean_over: unit that the total counts once, see the module.
+        by: group of a column.
         resamples: for 95 % bootstrap intervals, 0 for none.
         seed: of the resampling.
     """

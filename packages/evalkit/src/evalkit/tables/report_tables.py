@@ -1,4 +1,4 @@
-"""The tables of a report, described once: the page, Markdown and LaTeX show the same rows and numbers."""
+"""The tables of a report, defined once for the page, Markdown and LaTeX."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -25,9 +25,9 @@ SCORE_COLUMNS = (
     _column("recall at 0.1 diameter", "ADD", "add_recall_0.1d", "%", 1, "higher"),
     _column("recall at 0.1 diameter", "ADI", "adi_recall_0.1d", "%", 1, "higher"),
     _column("recall at 0.1 diameter", "ADD(-S)", "add_s_recall_0.1d", "%", 1, "higher"),
-    _column("share", "5 cm 5°", "5cm5deg", "%", 1, "higher"),
-    _column("share", "proj. 5 px", "proj_5px", "%", 1, "higher"),
-    _column("share", "diverged", "diverged", "%", 1, "lower"),
+    _column("fraction", "5 cm 5°", "5cm5deg", "%", 1, "higher"),
+    _column("fraction", "proj. 5 px", "proj_5px", "%", 1, "higher"),
+    _column("fraction", "diverged", "diverged", "%", 1, "lower"),
 )
 AREA_COLUMNS = (
     _column("AUC to 100 mm", "ADD", "add_auc_100mm", "", 3, "higher"),
@@ -74,7 +74,7 @@ SURFACE_COLUMNS = (
     *_mean_and_median("MSPD", "mspd_px", "px"),
     _column("run time", "an image", "time_s_per_image", "s", 3, "lower"),
 )
-ERRORS_NOTE = "Errors are over the estimates that were found."
+ERRORS_NOTE = "Errors are over the estimates found."
 PRECISION_NOTE = "Over all lines of the file with their scores, and all instances; a total is the mean over objects."
 SCORE_TABLES = (
     ("Scores", "scores", SCORE_COLUMNS, ""),
@@ -83,23 +83,23 @@ SCORE_TABLES = (
     ("Rotation and translation errors", "pose-errors", POSE_COLUMNS, ERRORS_NOTE),
     ("Distances of origins, surfaces and projections", "surface-errors", SURFACE_COLUMNS, ERRORS_NOTE),
 )
-"""Title, name, columns and note of the tables that every file has, in total and by object."""
+"""Title, name, columns and note of the tables of every file, in total and by object."""
 COMPARED = (
     _column("", "VSS mean", "vss_mean", "", 3, "higher"),
     _column("", "ADD(-S) recall at 0.1 diameter", "add_s_recall_0.1d", "%", 1, "higher"),
     _column("", "Median rotation error (best symmetry)", "re_sym_deg_median", "deg", 1, "lower"),
     _column("", "Median distance of the origins", "te_mm_median", "mm", 1, "lower"),
 )
-"""Scores that files are set side by side in, object by object."""
+"""Scores compared between files, object by object."""
 
 
 BIN_AXES: Mapping[str, tuple[str, str, float]] = {
-    "visibility": ("visible share of the true silhouette", "visib_fract", 1.0),
+    "visibility": ("visible fraction of the ground-truth silhouette", "visib_fract", 1.0),
     "distance": ("camera z of the object's origin, m", "distance_m", 1.0),
     "azimuth": ("camera's azimuth seen from the object, degrees", "view_azimuth_deg", 1.0),
     "elevation": ("camera's elevation seen from the object, degrees", "view_elevation_deg", 1.0),
 }
-"""What poses are binned by: its words with unit, its column, the factor to that unit."""
+"""Axes of the bins: label with unit, column of the error table, factor to that unit."""
 BIN_COLUMNS = (
     _column("", "mean VSS", "vss_mean", "", 3, "higher"),
     _column("", "ADD(-S) 0.1 d", "add_s_recall_0.1d", "%", 1, "higher"),
@@ -137,7 +137,7 @@ def report_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def total_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """A row for each result file: its scores, and its errors."""
+    """Scores and errors in total, a row for each result file."""
     rows = [(file["name"], *_scores(file, TOTAL)) for file in summary["files"]]
     first = TableColumn(key="name", heading="result file")
     resampled = ", ".join(dict.fromkeys(_resampled(file["intervals"]["total"]) for file in summary["files"]))
@@ -191,7 +191,7 @@ def comparison_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def _scores(file: Values, group: str) -> tuple[Values, Values]:
-    """Scores and intervals of one object of a file, or of all under `TOTAL`; empty without that object."""
+    """Scores and intervals of an object of a file, or of all objects under `TOTAL`; empty without that object."""
     if group == TOTAL:
         return file["total"], file["intervals"]["total"]["intervals"]
     return file["by_object"].get(group, {}), file["intervals"]["by_object"].get(group, {}).get("intervals", {})
@@ -207,10 +207,10 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
     tables = []
     for axis, (label, name, factor) in BIN_AXES.items():
         rows: dict[tuple[float, int], dict[str, Cell]] = {}
-        for place, file in enumerate(summary["files"]):
+        for index, file in enumerate(summary["files"]):
             for record in file["bins"][axis]:
                 low, high = factor * record[f"{name}_low"], factor * record[f"{name}_high"]
-                cells = rows.setdefault((low, place), {"low": low, "high": high, "expected": record["expected"]})
+                cells = rows.setdefault((low, index), {"low": low, "high": high, "expected": record["expected"]})
                 cells[record["score"]] = _cell(record, {"value": (record["low"], record["high"])}, "value")
                 cells |= {"found": record["found"]} | ({"file": file["name"]} if several else {})
         if rows:
@@ -232,37 +232,37 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def cause_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Why poses failed, see `evalkit.scores.failure_causes`: causes down, result files across; then a table a file."""
+    """Causes of failures (`evalkit.scores.failure_causes`): causes down, files across; then a table for each file."""
     files = summary["files"]
     columns = [TableColumn(key="cause", heading="cause")]
     rows: dict[str, dict[str, Cell]] = {
         cause: {"cause": cause, "meaning": CAUSES.get(cause, "")} for cause in (*CAUSES, "all failures")
     }
-    for place, file in enumerate(files):
-        poses, share = f"poses_{place}", f"share_{place}"
-        columns += [_column(file["name"], "poses", poses, "", 0), _column(file["name"], "share", share, "%", 1)]
+    for index, file in enumerate(files):
+        poses, fraction = f"poses_{index}", f"fraction_{index}"
+        columns += [_column(file["name"], "poses", poses, "", 0), _column(file["name"], "fraction", fraction, "%", 1)]
         counts = file["causes"]["total"]
         for cause, cells in rows.items():
             count = counts["failed" if cause == "all failures" else cause]
-            cells |= {poses: count, share: count / counts["expected"] if counts["expected"] else None}
-    columns.append(TableColumn(key="meaning", heading="what it means"))
+            cells |= {poses: count, fraction: count / counts["expected"] if counts["expected"] else None}
+    columns.append(TableColumn(key="meaning", heading="meaning"))
     return [
         Table(
             title="Failures by cause",
             name="causes",
             columns=columns,
             rows=[Row(cells=cells, total=cause == "all failures") for cause, cells in rows.items()],
-            note="Shares are of all expected poses; every failed pose has one cause.",
+            note="Fractions are of all expected poses; every failed pose has one cause.",
             best="",
         ),
-        *[_object_causes(file, place) for place, file in enumerate(files)],
+        *[_object_causes(file, index) for index, file in enumerate(files)],
     ]
 
 
-def _object_causes(file: Mapping[str, Any], place: int) -> Table:
+def _object_causes(file: Mapping[str, Any], index: int) -> Table:
     return Table(
         title=f"Failures of {file['name']} by cause and object",
-        name=f"causes-objects-{place}",
+        name=f"causes-objects-{index}",
         columns=[TableColumn(key="name", heading="object"), *CAUSE_COLUMNS],
         rows=[
             Row(cells={"name": _group_name(group)} | _cause_cells(counts), total=group == TOTAL)
@@ -274,12 +274,12 @@ def _object_causes(file: Mapping[str, Any], place: int) -> Table:
 
 def _cause_cells(counts: Mapping[str, int]) -> dict[str, Cell]:
     expected = counts["expected"]
-    shares = {key: counts[key] / expected if expected else None for key in ("failed", *CAUSES)}
-    return {"expected": expected, **shares}
+    fractions = {key: counts[key] / expected if expected else None for key in ("failed", *CAUSES)}
+    return {"expected": expected, **fractions}
 
 
 def curve_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Shares and errors by level of perturbation, where there are such starts."""
+    """Fractions and errors by level of perturbation, for files with perturbed initial poses."""
     curves = {
         file["name"]: {
             kind: [{key: float("nan") if value is None else value for key, value in point.items()} for point in points]
@@ -310,7 +310,7 @@ def _table(
         for index, (name, values, intervals) in enumerate(rows)
     ]
     columns = [first, *kept]
-    best: Best = "" if total_last else "column"  # objects are no competitors
+    best: Best = "" if total_last else "column"  # objects are not compared
     return Table(title=title, name=slug, columns=columns, rows=described, note=note, best=best)
 
 

@@ -19,7 +19,7 @@ SUFFIXES = (".md", ".tex", ".csv", ".json")
 
 
 def csv_text(table: Table) -> str:
-    """The table as CSV: keys as header, nine significant digits, shares as shares, empty where there is no value.
+    """The table as CSV: keys as header, nine significant digits, fractions from 0 to 1, empty where there is no value.
 
     A column with intervals is followed by `<key>_low` and `<key>_high`.
     """
@@ -82,10 +82,10 @@ def _json_cell(cell: Cell) -> Any:
 
 
 def require_suffixes(paths: Sequence[str | Path]) -> None:
-    """Check the suffixes of files to write, before the work whose tables they are to hold.
+    """Check the suffixes of files to write, before the tables are computed.
 
     Raises:
-        ConfigError: `write_tables` knows no such suffix.
+        ConfigError: a suffix is none of `SUFFIXES`.
     """
     for file in map(Path, paths):
         if file.suffix not in SUFFIXES:
@@ -93,7 +93,7 @@ def require_suffixes(paths: Sequence[str | Path]) -> None:
 
 
 def write_tables(path: str | Path, tables: Sequence[Table]) -> list[Path]:
-    """Write tables into a file of the kind that its suffix names: .md, .tex, .csv or .json.
+    """Write tables into a file in the format of its suffix: .md, .tex, .csv or .json.
 
     Args:
         path: file; several tables as CSV go into one file each, `<stem>_<name>.csv`.

@@ -1,10 +1,10 @@
-"""Tracking: how far a tracked pose stays from the truth along a sequence, how steady it is, and how often it is lost.
+"""Tracking: errors of a tracked pose along a sequence, jitter, and lost frames.
 
 The tables are those of section 4.2 (figure 5) of the 2018 paper, on the sequences of Choi and Christensen ("RGB-D
 Object Tracking: A Particle Filter Approach on GPU", IROS 2013): root mean squares of x, y, z in millimetres and of
 roll, pitch, yaw in degrees; and the success rate of the RBOT data set (Tjaden et al., "A Region-based Gauss-Newton
-Approach to Real-Time Monocular Multiple Object Tracking", TPAMI 2018): the share of frames within 5 cm and 5 degrees,
-where a tracker that fails is set back to the truth of that frame and goes on from there.
+Approach to Real-Time Monocular Multiple Object Tracking", TPAMI 2018): the fraction of frames within 5 cm and 5
+degrees, where a tracker that fails is reset to the ground truth of that frame.
 """
 
 from evalkit.tracking.job import TrackingJob, make_tracking_table

@@ -58,7 +58,7 @@ def make_tracking_table(job: TrackingJob) -> tuple[Table, list[Path]]:
         expected = frames_of(dataset, file, all_frames=job.all_frames)
         tracks.append([track for track in tracks_of(dataset, file, *expected) if _is_scored(track, job)])
     if not any(tracks):
-        raise ConfigError(f"{dataset.root}: none of its targets has this --scene and --object; leave one of them away")
+        raise ConfigError(f"{dataset.root}: none of its targets has this --scene and --object; leave either out")
     named = named_tracks(files, tracks)
     table = axis_table(named) if job.by_axis else sequence_table(named, resamples=job.resamples, seed=job.seed)
     return table, [written for path in job.out for written in write_tables(path, [table])]

@@ -1,6 +1,6 @@
-"""What is left between tracked and true poses, in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
+"""Residuals of tracked poses in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
 
-Objects with symmetries take it to the copy of the truth that lies nearest in rotation.
+For objects with symmetries, the residual is to the symmetry-equivalent ground truth nearest in rotation.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ TIE_RAD = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """What is left between estimates and truths, in camera axes; NaN where there is no estimate.
+    """Residuals of estimates in camera axes; NaN where there is no estimate.
 
     Attributes:
         R: (n, 3, 3) `R_est R_gt^-1`.
@@ -43,7 +43,7 @@ def residuals(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: S
 
     Args:
         T_est: estimates `T_cam_obj`, metres, NaN where there is none.
-        T_gt: truths.
+        T_gt: ground truth.
         info: symmetries of the object, None for none.
     """
     R, dt_m = _to_copies(T_est[:, :3, :3], T_est, T_gt, info)
@@ -69,25 +69,25 @@ def _nearest_copies(R: Float[Array, "n s 3 3"]) -> Int[Array, " n"]:
 def changes(
     T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """By how much the residual changes from each frame to the next (m = n - 1): metres and radians; NaN beside a gap.
+    """Change of the residual from each frame to the next (m = n - 1), metres and radians; NaN beside a gap.
 
-    The later frame's residual is to the copy of the truth that is nearest to the earlier frame's residual.
+    The later frame's residual is to the symmetry-equivalent ground truth nearest to the earlier frame's residual.
     """
-    found = residuals(T_est, T_gt, info)
-    before_R, before_t = found.R[:-1], found.dt_m[:-1]
+    errors = residuals(T_est, T_gt, info)
+    before_R, before_t = errors.R[:-1], errors.dt_m[:-1]
     back = np.swapaxes(before_R, -1, -2) @ T_est[1:, :3, :3]
     R, dt_m = _to_copies(back, T_est[1:], T_gt[1:], info)
-    turned = se3.rotation_angle_rad(R @ np.swapaxes(before_R, -1, -2)[:, None])
-    chosen = np.where(np.isnan(turned), np.inf, turned).argmin(axis=1)
+    angles_rad = se3.rotation_angle_rad(R @ np.swapaxes(before_R, -1, -2)[:, None])
+    chosen = np.where(np.isnan(angles_rad), np.inf, angles_rad).argmin(axis=1)
     rows = np.arange(len(chosen))
     moved = np.linalg.norm(dt_m[rows, chosen] - before_t, axis=1)
-    return np.asarray(moved), np.asarray(turned[rows, chosen])
+    return np.asarray(moved), np.asarray(angles_rad[rows, chosen])
 
 
 def _to_copies(
     R_near: Float[Array, "n 3 3"], T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
 ) -> tuple[Float[Array, "n s 3 3"], Float[Array, "n s 3"]]:
-    """Residuals to the copies of the truth: one for each discrete symmetry.
+    """Residuals to the symmetry-equivalent ground-truth poses: one for each discrete symmetry.
 
     Where there is an axis of rotation, each copy is turned about it so that it comes as near as possible to `R_near`,
     exactly: sampled turns would put their step into the residual and shake it from frame to frame.
@@ -96,7 +96,7 @@ def _to_copies(
     R = T_est[:, None, :3, :3] @ np.swapaxes(copies[..., :3, :3], -1, -2)
     gone = np.isnan(R).any(axis=(-2, -1), keepdims=True)
     # Annotations are orthonormal to three digits only. A rotation times a stretch has that rotation as its nearest one,
-    # so transposing instead of inverting the truth costs nothing.
+    # so transposing instead of inverting the ground truth costs nothing.
     R = np.where(gone, np.nan, se3.nearest_rotation(np.where(gone, np.eye(3), R)))
     return np.asarray(R), np.asarray(T_est[:, None, :3, 3] - copies[..., :3, 3])
 
@@ -110,10 +110,10 @@ def _symmetries(
     if not axes:
         return fixed
     if is_ball(axes):
-        near = [align_ball(axes, truth, se3.make_T(R, np.zeros(3))) for truth, R in zip(T_gt, R_near, strict=True)]
+        near = [align_ball(axes, gt, se3.make_T(R, np.zeros(3))) for gt, R in zip(T_gt, R_near, strict=True)]
         return np.array(near).reshape(-1, 1, 4, 4)
-    turn = np.linalg.inv(T_gt[:, :3, :3])[:, None] @ R_near[:, None] @ np.swapaxes(fixed[..., :3, :3], -1, -2)
-    return np.asarray(_turns_nearest(turn, np.array(axes[0].axis), np.array(axes[0].offset_m)) @ fixed)
+    M = np.linalg.inv(T_gt[:, :3, :3])[:, None] @ R_near[:, None] @ np.swapaxes(fixed[..., :3, :3], -1, -2)
+    return np.asarray(_turns_nearest(M, np.array(axes[0].axis), np.array(axes[0].offset_m)) @ fixed)
 
 
 def _turns_nearest(
