@@ -200,7 +200,7 @@ def bop(tmp_path, mesh, frame):
     make_bop(root, image, camera, truths, mesh)
     starts = [*starts_of(truths, mesh), se3.make_T(np.eye(3), np.array([0, 0, -0.5]))]
     estimates = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=T) for T in starts]
-    sidecar = {"dataset": str(root), "method": "start", "perturbation": {"rows": [{"line": 2}]}}
+    sidecar = {"dataset": str(root), "method": "initial", "perturbation": {"rows": [{"line": 2}]}}
     write_results(tmp_path / "start.csv", estimates, sidecar)
     return root, tmp_path / "start.csv"
 

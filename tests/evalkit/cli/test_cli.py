@@ -55,7 +55,7 @@ def test_report_without_arguments(work):
     assert against["medians"]["tz_mm"]["ratio"] == pytest.approx(0.25, rel=1e-3)
     assert against["words"] in result.output
     assert "1 pose is missing in quick" in against["words"]
-    assert "z error down to 0.25 of the start's" in against["words"]
+    assert "z error down to 0.25 of the initial one" in against["words"]
 
 
 def test_the_page_stands_alone_and_says_what_it_measured(work):
@@ -156,7 +156,7 @@ def test_curves_by_level(work):
     ("arguments", "code", "message"),
     [
         (["report", "--dataset", "nowhere", "--results", "results/quick.csv"], 1, "nowhere: no such folder"),
-        (["report", "--results", "absent.csv"], 2, "absent.csv: no sidecar says which dataset"),
+        (["report", "--results", "absent.csv"], 2, "absent.csv: no sidecar names the dataset"),
         (["report", "--dataset", "test_bop", "--results", "absent.csv"], 1, "absent.csv: cannot be read"),
         (
             ["report", "--dataset", "test_bop", "--results", "results/quick.csv", "--results", "results/quick.csv"],

@@ -244,7 +244,7 @@ def test_a_report_table_of_several_files_needs_their_names(tmp_path):
     a = write_errors(tmp_path / "estimates.csv", start=errors_table(3, vss=0.5), fine=errors_table(3, vss=0.75))
     result = run("diff", a, a)
     assert result.exit_code == 2
-    assert "holds start, fine; say which with --result-a and --result-b" in result.stderr
+    assert "holds start, fine; name one with --result-a and --result-b" in result.stderr
     result = run("diff", a, a, "--result-a", "start", "--result-b", "fine", "--json", tmp_path / "d.json")
     assert result.exit_code == 0
     content = json.loads((tmp_path / "d.json").read_text())

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from evalkit.cli import main
-from evalkit.inputs.perturbation import PROTOCOLS, departures
+from evalkit.inputs.perturbation import PROTOCOLS, protocol_deviations
 from posecore.bop import BopDataset, read_results, read_sidecar
 
 
@@ -49,8 +49,8 @@ def test_levels_without_a_protocol_name_none(dataset_path, tmp_path):
 
 def test_too_few_iterations_depart_from_the_papers_protocol():
     sidecar = {"perturbation": {"protocol": "paper", "rows": []}, "settings": {"iterations": 5}}
-    assert departures(sidecar) == ["refined in 5 iterations, while protocol 'paper' asks for 10"]
-    assert departures(sidecar | {"settings": {"iterations": 10}}) == []
+    assert protocol_deviations(sidecar) == ["refined in 5 iterations, while protocol 'paper' asks for 10"]
+    assert protocol_deviations(sidecar | {"settings": {"iterations": 10}}) == []
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_too_few_iterations_depart_from_the_papers_protocol():
     ],
 )
 def test_what_names_no_protocol_departs_from_none(sidecar):
-    assert departures(sidecar) == []
+    assert protocol_deviations(sidecar) == []
 
 
 def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(dataset_path, tmp_path):

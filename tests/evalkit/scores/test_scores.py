@@ -365,7 +365,7 @@ def plain_matches(errors, scores_of, limit):
 def test_fast_matching_is_the_plain_one(seed):
     data = world(seed)
     error = np.round(data.errors.mssd_m.to_numpy() / 0.1, 1)  # many ties
-    estimate, gt = data.errors.estimate.to_numpy(), data.errors.gt.to_numpy()
+    estimate, gt = data.errors.estimate.to_numpy(), data.errors.instance.to_numpy()
     limits = np.array([0.1, 0.25, 0.5])
     rank = ranks(data.estimates, ["scene_id", "im_id", "obj_id"])
     fast = greedy_matches(estimate, gt, error, rank, len(data.instances), limits)

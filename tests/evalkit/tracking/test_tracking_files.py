@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from evalkit.cli.group import CleanGroup
 from evalkit.cli.tracking import tracking
 from evalkit.inputs.result_files import load_result_files
 from evalkit.tracking import frames_of, track_scores, tracks_of
@@ -13,13 +12,14 @@ from posecore import se3
 from posecore.bop import BopDataset, BopWriter, Estimate, GroundTruth, write_models, write_results, write_targets
 from posecore.bop.annotations import Target
 from posecore.camera import Camera
+from posecore.command_line import ErrorReportingGroup
 from posecore.errors import ResultFileError
 from posecore.mesh import load_mesh
 
 TUG, BOBBIN = 1, 5
 FRAMES = tuple(range(10, 30, 2))  # ten frames with gaps in their numbers, which are no gaps in time
 CAMERA = Camera(K=np.array([[100.0, 0, 16], [0, 100, 12], [0, 0, 1]]), width_px=32, height_px=24)
-GROUP = CleanGroup(commands={"tracking": tracking})
+GROUP = ErrorReportingGroup(commands={"tracking": tracking})
 
 
 def pose(frame, x_m):
@@ -166,7 +166,6 @@ def test_several_files_stand_side_by_side_and_are_written_as_asked(sequence, tmp
     [
         (("--scene", 9), 2, "none of its targets has this --scene and --object"),
         (("--out", "t.docx"), 2, "t.docx: found suffix '.docx'"),
-        (("--choi-legacy",), 2, "--choi-legacy: removed, angles are always those of the residual rotation"),
     ],
 )
 def test_mistakes_are_one_line(sequence, tmp_path, arguments, code, message):
@@ -177,13 +176,20 @@ def test_mistakes_are_one_line(sequence, tmp_path, arguments, code, message):
     assert message in result.stderr
 
 
+def test_the_removed_option_is_refused(sequence, tmp_path):
+    write_results(tmp_path / "r.csv", tugs())
+    result = run("--dataset", sequence, "--results", tmp_path / "r.csv", "--choi-legacy")
+    assert result.exit_code == 2
+    assert "--choi-legacy is now removed: angles are those of the residual rotation" in result.stderr
+
+
 def test_perturbed_starts_are_no_sequence(sequence, tmp_path):
     write_results(tmp_path / "r.csv", tugs())
     dataset = BopDataset(sequence)
     (file,) = load_result_files([tmp_path / "r.csv"], dataset)
     table, T_est, T_gt = frames_of(dataset, file)
     table.loc[1, ["im_id", "obj_id", "gt_index"]] = table.loc[0, ["im_id", "obj_id", "gt_index"]]
-    with pytest.raises(ResultFileError, match="has several poses of an instance"):
+    with pytest.raises(ResultFileError, match="has several poses of the object"):
         tracks_of(dataset, file, table, T_est, T_gt)
 
 

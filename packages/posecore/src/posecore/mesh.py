@@ -64,6 +64,10 @@ class Mesh:
         """Centre of the axis-aligned bounding box in object coordinates, metres."""
         return np.asarray((self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2)
 
+    def center_cam_m(self, T_cam_obj: Float[Array, "*b 4 4"]) -> Float[Array, "*b 3"]:
+        """Centre of the bounding box in camera coordinates at each pose, metres."""
+        return np.asarray(T_cam_obj[..., :3, :3] @ self.center_m + T_cam_obj[..., :3, 3])
+
     @cached_property
     def colours(self) -> UInt8[Array, "v 3"]:
         """Vertex colours; sampled from the texture where there is one, mid grey where there is nothing."""

@@ -5,7 +5,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 
 from posecore import se3
 
@@ -136,10 +136,29 @@ def cut(
     )
 
 
-def cut_rgb(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
-    """The scene patch of a window, antialiased, black outside the image; touches only the window's part of it."""
+def pixels_inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[Array, "p p"]:
+    """Mask of the patch pixels whose centres lie in the image."""
+    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
+    u, v = window.x0_px + centre, window.y0_px + centre
+    return ((v >= 0) & (v < height_px))[:, None] & ((u >= 0) & (u < width_px))[None]
+
+
+def cut_rgb(
+    image: UInt8[Array, "h w 3"], window: Window, patch_px: int, border: Literal["zero", "replicate"] = "zero"
+) -> UInt8[Array, "p p 3"]:
+    """The scene patch of a window, antialiased; reads only the window's part of the image.
+
+    Outside the image the patch is black, or with `replicate` continues the image's border, so that there is no edge.
+    """
     margin = 8 + int(2 * window.side_px / patch_px)
     x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
+    if border == "replicate":
+        size = int(np.ceil(window.side_px)) + 2 * margin + 1
+        columns = np.arange(x0, x0 + size).clip(0, image.shape[1] - 1)
+        rows = np.arange(y0, y0 + size).clip(0, image.shape[0] - 1)
+        padded = np.ascontiguousarray(image[rows[:, None], columns])
+        shifted = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
+        return np.asarray(cut(padded, shifted, patch_px, interpolation="area"))
     x1, y1 = int(x0 + window.side_px + 2 * margin + 2), int(y0 + window.side_px + 2 * margin + 2)
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, image.shape[1]), min(y1, image.shape[0])
     if x1 <= x0 or y1 <= y0:

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import click
+from posecore.command_line import renamed_options
 
-from evalkit.cli.options import FOLDER, NEW_FILE, removed_option, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 
 
 @click.command()
@@ -16,16 +17,16 @@ from evalkit.cli.options import FOLDER, NEW_FILE, removed_option, split_option
 @click.option("--scene", "scenes", multiple=True, type=int, help="Only this sequence. Repeatable.")
 @click.option("--object", "objects", multiple=True, type=int, help="Only this object. Repeatable.")
 @click.option("--all-frames", is_flag=True, help="Score every annotated pose, not only the targets.")
-@removed_option("--choi-legacy", "angles are always those of the residual rotation")
+@renamed_options({"--choi-legacy": "removed: angles are those of the residual rotation"})
 @click.option("--by-axis", is_flag=True, help="The paper's layout: a row for each axis, a column for each file.")
 @click.option(
     "--resamples",
     type=click.IntRange(0),
     default=0,
-    show_default=True,
     help="For 95 % intervals of the means over sequences; 1000 are enough.",
 )
 @click.option("--out", multiple=True, type=NEW_FILE, help="Also write a file: .md, .tex, .csv or .json. Repeatable.")
+@verbose_option
 def tracking(
     dataset: Path | None,
     results: tuple[Path, ...],

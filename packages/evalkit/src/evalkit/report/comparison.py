@@ -44,9 +44,9 @@ def compare(reference: Scored, other: Scored, *, resamples: int = 1000, seed: in
     Returns:
         `name`, `reference` (its name), `is_initial` (of the reference), `poses` (found in both), `missing` (in the
         other file), `medians` by error with `poses`, `reference`, `refined`, `ratio`, `difference`, `interval`;
-        `vss_mean` and `add_s_recall` with the same but for the ratio; `resampled` (units in words); `headline`, `verdict` (scores
-        that are better, worse, or without significant change; empty without intervals), `changes`, a phrase for each
-        number, and `words`, the whole text. Values without data are NaN.
+        `vss_mean` and `add_s_recall` with the same but for the ratio; `resampled` (units in words); `headline`;
+        `verdict` (scores that are better, worse, or without significant change; empty without intervals); `changes`, a
+        phrase for each number; and `words`, the whole text. Values without data are NaN.
     """
     reference_cases, other_cases = reference.cases(), other.cases()
     rows = np.array([(reference_cases[key], row) for key, row in other_cases.items() if key in reference_cases])

@@ -127,8 +127,8 @@ def number_of(cell: Cell) -> float | None:
 def best_cells(table: Table) -> set[tuple[int, str]]:
     """Row number and column key of the cells to set bold: the best ones, all that show the same rounded number.
 
-    A comparison needs two values at least. Down a column, rows of the same group are compared, totals separately; along a
-    row, the columns with a `better` value.
+    A comparison needs two values at least. Down a column, rows of the same group are compared, totals separately; along
+    a row, the columns with a `better` value.
     """
     compared: dict[Any, list[tuple[int, TableColumn]]] = {}
     for index, row in enumerate(table.rows):

@@ -86,7 +86,7 @@ def tracks_of(
         if (np.diff(images) == 0).any():
             twice = int(images[:-1][np.diff(images) == 0][0])
             raise ResultFileError(
-                f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of an instance; "
+                f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of the object; "
                 "a tracked sequence has one (perturbed initial poses are for `evalkit report`)"
             )
         mark = f", instance {instance + 1}" if (scene_id, obj_id) in several else ""
@@ -101,7 +101,7 @@ def tracks_of(
                 T_est=T_est[rows],
                 T_gt=T_gt[rows],
                 time_s=time_s[rows],
-                was_initialised=_were_initialised(resets, images, scene_id, obj_id, instance),
+                was_initialised=_were_initialised(resets, images, int(scene_id), int(obj_id), int(instance)),
                 info=dataset.models_info[int(obj_id)],
             )
         )

@@ -15,6 +15,7 @@ from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
 from posecore.errors import ResultFileError
 from posecore.files import write_atomic
+from posecore.renamed import migrated_keys
 
 __all__ = [
     "Estimate",
@@ -34,6 +35,13 @@ __all__ = [
 
 Array = np.ndarray
 SUSPICIOUS_DISTANCE_MM = 10.0
+RENAMED = {
+    "start_lines": "initial_lines",
+    "method=start": "method=initial",
+    "settings.sure": "settings.tracking_threshold",
+    "settings.found": "settings.reacquire_threshold",
+}
+"""Sidecar keys and values of version 0.1 by name, see `posecore.renamed`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,7 +210,9 @@ def sidecar_path(path: str | Path) -> Path:
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """What a result file's sidecar says (dataset, method, settings), or None where there is none.
+    """Content of a result file's sidecar (dataset, method, settings), or None where there is none.
+
+    Sidecars of earlier versions have the names of this one.
 
     Raises:
         DatasetError: the sidecar is not valid JSON; the message names file, line and column.
@@ -211,7 +221,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     content: dict[str, Any] = read_json(file)
-    return content
+    return migrated_keys(content, RENAMED)
 
 
 def write_results(path: str | Path, estimates: Sequence[Estimate], sidecar: dict[str, Any] | None = None) -> None:

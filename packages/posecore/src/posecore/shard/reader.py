@@ -69,6 +69,11 @@ class ShardReader:
         """Whether every shard is there."""
         return len(self._lines) == n_shards(self.card)
 
+    @property
+    def manifest_lines(self) -> Mapping[int, Mapping[str, Any]]:
+        """Lines of the manifest by shard id, sorted."""
+        return {shard_id: self._lines[shard_id] for shard_id in self.committed}
+
     def n_samples(self, shard_id: int) -> int:
         """Samples in a shard."""
         return samples_in(self.card, shard_id)
