@@ -13,6 +13,7 @@ from evalkit.cli import main
 from evalkit.diff import COUNTS, MEASURES, Side, Sides, differences, judge, open_sides, parse_rule
 from evalkit.diff.deltas import paired_rows
 from evalkit.diff.rules import OPERATORS, STATISTICS
+from evalkit.diff.sides import read_errors
 from evalkit.report.job import estimates_csv
 from posecore import se3
 from posecore.bop import write_results
@@ -361,3 +362,15 @@ def test_one_file_against_itself_is_all_zero(results):
     assert result.exit_code == 0, result.output
     assert "good (A)" in result.stdout
     assert "good (B)" in result.stdout
+
+
+def test_error_tables_of_earlier_versions_are_read(tmp_path):
+    table = errors_table(3, initial_angle_deg=[5.0, 10.0, 15.0], initial_translation_diameter=0.0)
+    path = write_errors(tmp_path / "estimates.csv", refined=table)
+    head, rest = path.read_text().split("\n", 1)
+    old = head.replace("initial_angle_deg", "start_angle_deg").replace("initial_trans", "start_trans")
+    assert old != head
+    path.write_text(f"{old}\n{rest}")
+    read = read_errors(path).table
+    assert read.initial_angle_deg.tolist() == [5.0, 10.0, 15.0]
+    assert read.initial_translation_diameter.tolist() == [0.0] * 3

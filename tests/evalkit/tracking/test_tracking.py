@@ -349,7 +349,7 @@ def test_sequences_that_cannot_be_tracked_are_refused():
     with pytest.raises(ConfigError, match="without frames"):
         run_with_resets(FakeTracker(T_gt, {}), [], [])
     T_gt[1] = np.nan
-    with pytest.raises(ConfigError, match="frame 1 has no true pose"):
+    with pytest.raises(ConfigError, match="frame 1 has no ground-truth pose"):
         run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt)
     with pytest.raises(ValueError, match="zip"):
         run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt)

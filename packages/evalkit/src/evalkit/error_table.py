@@ -68,6 +68,12 @@ COLUMNS: Mapping[str, ErrorColumn] = {
     ),
 }
 
+RENAMED_COLUMNS: Mapping[str, str] = {
+    "start_angle_deg": "initial_angle_deg",
+    "start_translation_diameter": "initial_translation_diameter",
+}
+"""New name of columns that error tables of earlier versions have under another one."""
+
 
 def table_of(columns: Mapping[str, Sequence[Any] | Array]) -> pd.DataFrame:
     """A table from its columns, all of `COLUMNS` and maybe others (VSD's); an empty one from none."""

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
-from posecore.bop import symmetry_transforms
 from posecore.errors import ConfigError
 
 from evalkit.diff.measures import MEASURES
@@ -221,6 +220,5 @@ def _change(old: Float[Array, " p"], new: Float[Array, " p"], delta: Float[Array
 def _causes(side: Side, sides: Sides, limit_diameters: float) -> Array:
     assert side.scored is not None and sides.evaluator is not None
     infos = sides.evaluator.dataset.models_info
-    symmetries = {int(obj_id): symmetry_transforms(infos[int(obj_id)]) for obj_id in side.table.obj_id.unique()}
-    chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, symmetries, limit_diameters=limit_diameters)
+    chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, infos, limit_diameters=limit_diameters)
     return np.asarray(chosen.astype(str).to_numpy())

@@ -11,7 +11,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
 
-from evalkit.error_table import COLUMNS
+from evalkit.error_table import COLUMNS, RENAMED_COLUMNS
 from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.result_files import dataset_of, load_result_files
@@ -156,7 +156,7 @@ def _rows(path: Path) -> pd.DataFrame:
             lines = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ResultFileError(f"{path}: cannot be read as CSV ({error})") from error
-    head = [name.strip() for name in lines[0]]
+    head = [RENAMED_COLUMNS.get(name, name) for name in map(str.strip, lines[0])]
     body = {number: line for number, line in enumerate(lines[1:], start=2) if any(part.strip() for part in line)}
     for number, line in body.items():
         if len(line) != len(head):

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
-from posecore.bop import BopDataset, symmetry_transforms
+from posecore.bop import BopDataset, ModelInfo
 from posecore.files import sha256_bytes, sha256_file
 
 from evalkit import __version__
@@ -33,8 +32,6 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
     initial = [item for item in scored if item.file.is_initial]
     distances_m = [column(item.table, "distance_m") for item in scored]
     distance_edges_m = bins.round_edges(np.concatenate(distances_m) if distances_m else np.zeros(0))
-    obj_ids = sorted({int(obj_id) for item in scored for obj_id in item.table.obj_id.unique()})
-    symmetries = {obj_id: symmetry_transforms(dataset.models_info[obj_id]) for obj_id in obj_ids}
     summary = {
         "dataset": {
             "name": dataset.name,
@@ -46,7 +43,7 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
         "vss": vss,
         "definitions": dict(DEFINITIONS) | {"VSS variant": VSS_DEFINITIONS[vss]},
         "versions": versions(),
-        "files": [_file_summary(item, distance_edges_m, symmetries) for item in scored],
+        "files": [_file_summary(item, distance_edges_m, dataset.models_info) for item in scored],
         "against_initial": [
             compare(initial_of(item, initial), item) for item in scored if initial and item is not initial[0]
         ],
@@ -56,9 +53,7 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
     return cleaned
 
 
-def _file_summary(
-    item: Scored, distance_edges_m: Sequence[float], symmetries: Mapping[int, Float[Array, "_ 4 4"]]
-) -> dict[str, Any]:
+def _file_summary(item: Scored, distance_edges_m: Sequence[float], infos: Mapping[int, ModelInfo]) -> dict[str, Any]:
     sidecar = {key: value for key, value in item.file.sidecar.items() if key not in ("perturbation", "initial_lines")}
     return {
         "name": item.file.name,
@@ -74,7 +69,7 @@ def _file_summary(
         },
         "by_level": by_level(item.table),
         "bins": bins_of(item.table, distance_edges_m),
-        "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, symmetries)).to_dict("index"),
+        "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, infos)).to_dict("index"),
         "intervals": {
             "total": score_intervals(item.table).as_json(),
             "by_object": {

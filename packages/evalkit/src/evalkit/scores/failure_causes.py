@@ -35,6 +35,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 from posecore import se3
+from posecore.symmetry import Symmetric, nearest_symmetric
 
 from evalkit.error_table import column
 from evalkit.scores.definitions import RECALL_DIAMETERS
@@ -46,8 +47,6 @@ FLIP_RAD = np.deg2rad(160.0)
 NEAR_FLIP_RAD = np.deg2rad(45.0)
 NEAR_FLIP_VSS = 0.8
 ARM_DIAMETERS = 0.27
-CHUNK = 3_000_000
-"""Largest number of poses times symmetries held at once."""
 
 CAUSES: Mapping[str, str] = {
     "missed": "no estimate",
@@ -107,27 +106,11 @@ def parts_of(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"]) -> Parts
     )
 
 
-def nearest_symmetric_poses(
-    T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], symmetries: Float[Array, "s 4 4"]
-) -> Float[Array, "n 4 4"]:
-    """Each ground-truth pose at the symmetry with the smallest angle to the estimate; the first of equal ones."""
-    nearest = np.empty_like(T_gt)
-    rotations = symmetries[:, :3, :3].reshape(len(symmetries), 9)
-    step = max(1, CHUNK // len(symmetries))
-    for start in range(0, len(T_gt), step):
-        part = slice(start, start + step)
-        relative = np.swapaxes(T_gt[part, :3, :3], 1, 2) @ T_est[part, :3, :3]
-        traces = np.nan_to_num(relative.reshape(-1, 9) @ rotations.T)
-        best = np.argmax(traces > traces.max(axis=1, keepdims=True) - 1e-9, axis=1)
-        nearest[part] = T_gt[part] @ symmetries[best]
-    return nearest
-
-
 def causes(
     table: pd.DataFrame,
     T_est: Float[Array, "n 4 4"],
     T_gt: Float[Array, "n 4 4"],
-    symmetries: Mapping[int, Float[Array, "_ 4 4"]] | None = None,
+    infos: Mapping[int, Symmetric] | None = None,
     *,
     limit_diameters: float = RECALL_DIAMETERS,
 ) -> "pd.Series[str]":
@@ -137,8 +120,7 @@ def causes(
         table: see `evalkit.error_table`.
         T_est: estimates `T_cam_obj` of its rows, metres, NaN where missing.
         T_gt: ground-truth poses.
-        symmetries: of each object, as `posecore.bop.symmetry_transforms` gives them; the identity alone for objects
-            that are not in it.
+        infos: symmetries of the objects; objects without an entry have none.
         limit_diameters: an ADD(-S) of so many diameters or more is a failure.
 
     Returns:
@@ -147,10 +129,10 @@ def causes(
     failed = ~solved(table, limit_diameters)
     diameter_m = column(table, "diameter_m")
     T_nearest = T_gt.astype(np.float64)
-    for obj_id, transforms in (symmetries or {}).items():
+    for obj_id, info in (infos or {}).items():
         rows = np.flatnonzero(failed & (table.obj_id.to_numpy() == obj_id))
-        if len(transforms) > 1 and len(rows):
-            T_nearest[rows] = nearest_symmetric_poses(T_est[rows], T_nearest[rows], transforms)
+        if (info.symmetries_discrete or info.symmetries_continuous) and len(rows):
+            T_nearest[rows] = nearest_symmetric(T_nearest[rows], T_est[rows], info)
     parts = parts_of(T_est, T_nearest)
     is_found = column(table, "found") > 0
     other = column(table, "other_mssd_m")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from posecore import se3
-from posecore.symmetry import Symmetric, align_ball, is_ball
+from posecore.symmetry import Symmetric, symmetric_copies
 
 Array = np.ndarray
 TIE_RAD = 1e-6
@@ -89,46 +89,16 @@ def _to_copies(
 ) -> tuple[Float[Array, "n s 3 3"], Float[Array, "n s 3"]]:
     """Residuals to the symmetry-equivalent ground-truth poses: one for each discrete symmetry.
 
-    Where there is an axis of rotation, each copy is turned about it so that it comes as near as possible to `R_near`,
-    exactly: sampled turns would put their step into the residual and shake it from frame to frame.
+    With an axis of revolution, each is rotated about it to come nearest to `R_near`, exactly: sampled angles would put
+    their step into the residual and shake it from frame to frame.
     """
-    copies = T_gt[:, None] @ _symmetries(R_near, T_gt, info)
+    copies = symmetric_copies(T_gt, se3.make_T(R_near, np.zeros((len(R_near), 3))), info)
     R = T_est[:, None, :3, :3] @ np.swapaxes(copies[..., :3, :3], -1, -2)
     gone = np.isnan(R).any(axis=(-2, -1), keepdims=True)
     # Annotations are orthonormal to three digits only. A rotation times a stretch has that rotation as its nearest one,
     # so transposing instead of inverting the ground truth costs nothing.
     R = np.where(gone, np.nan, se3.nearest_rotation(np.where(gone, np.eye(3), R)))
     return np.asarray(R), np.asarray(T_est[:, None, :3, 3] - copies[..., :3, 3])
-
-
-def _symmetries(
-    R_near: Float[Array, "n 3 3"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
-) -> Float[Array, "n s 4 4"]:
-    fixed = np.stack([np.eye(4), *(info.symmetries_discrete if info is not None else ())])
-    fixed = np.broadcast_to(fixed, (len(T_gt), *fixed.shape))
-    axes = info.symmetries_continuous if info is not None else ()
-    if not axes:
-        return fixed
-    if is_ball(axes):
-        near = [align_ball(axes, gt, se3.make_T(R, np.zeros(3))) for gt, R in zip(T_gt, R_near, strict=True)]
-        return np.array(near).reshape(-1, 1, 4, 4)
-    M = np.linalg.inv(T_gt[:, :3, :3])[:, None] @ R_near[:, None] @ np.swapaxes(fixed[..., :3, :3], -1, -2)
-    return np.asarray(_turns_nearest(M, np.array(axes[0].axis), np.array(axes[0].offset_m)) @ fixed)
-
-
-def _turns_nearest(
-    M: Float[Array, "n s 3 3"], axis: Float[Array, "3"], offset_m: Float[Array, "3"]
-) -> Float[Array, "n s 4 4"]:
-    """The turn C about a line that brings `M C^T` nearest to the identity.
-
-    The trace of `M C^T` is a constant plus `cos * (trace M - a M a) + sin * (a . w)`, with w the vector of the skew
-    part of M: the angle of its largest value is an arc tangent.
-    """
-    skew = np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
-    along = np.einsum("i,...ij,j->...", axis, M, axis)
-    angle = np.arctan2(skew @ axis, np.trace(M, axis1=-2, axis2=-1) - along)
-    R = se3.rotation_from_rotvec(np.nan_to_num(angle)[..., None] * axis)
-    return se3.make_T(R, offset_m - R @ offset_m)
 
 
 def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
