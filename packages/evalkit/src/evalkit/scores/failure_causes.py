@@ -56,7 +56,7 @@ CAUSES: Mapping[str, str] = {
     "z only": "would pass without its error along the viewing ray",
     "in plane only": "would pass without its translation across the viewing ray and its rotation about the ray",
     "rotation only": "would pass without its rotation error",
-    "large": "several errors; would fail without any single one",
+    "large": "several errors; would still fail without any single part",
 }
 SOLVED = ""
 """In place of a cause where a pose has not failed."""
