@@ -149,7 +149,7 @@ def adi_by_trees(
     """ADI with a k-d tree for each estimate: the reference of `metrics.adi`, which walks a Delaunay graph."""
     return np.array(
         [
-            cKDTree(se3.apply(est, points_m)).query(se3.apply(gt, points_m))[0].mean()
+            np.mean(cKDTree(se3.apply(est, points_m)).query(se3.apply(gt, points_m))[0])
             for est, gt in zip(T_est, T_gt, strict=True)
         ]
     )
