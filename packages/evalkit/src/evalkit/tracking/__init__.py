@@ -8,19 +8,19 @@ degrees, where a tracker that fails is reset to the ground truth of that frame.
 """
 
 from evalkit.tracking.job import TrackingJob, make_tracking_table
-from evalkit.tracking.reset_run import ResetRun, Tracker, run_with_resets
+from evalkit.tracking.reset_run import ResetRun, ResettableTracker, run_with_resets
 from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.scores import TRACKING_DEFINITIONS, track_scores
 from evalkit.tracking.tables import TrackedFile, axis_table, named_tracks, sequence_table
-from evalkit.tracking.tracks import Track, frames_of, tracks_of
+from evalkit.tracking.tracks import ObjectTrack, frames_of, tracks_of
 
 __all__ = [
     "TRACKING_DEFINITIONS",
+    "ObjectTrack",
     "ResetRun",
+    "ResettableTracker",
     "Residuals",
-    "Track",
     "TrackedFile",
-    "Tracker",
     "TrackingJob",
     "axis_table",
     "changes",

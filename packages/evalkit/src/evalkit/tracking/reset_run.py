@@ -22,7 +22,7 @@ Frame = TypeVar("Frame", contravariant=True)
 
 
 @runtime_checkable
-class Tracker(Protocol[Frame]):
+class ResettableTracker(Protocol[Frame]):
     """Interface of a tracker for `run_with_resets`."""
 
     def initialise(self, frame: Frame, T_cam_obj: Float[Array, "4 4"]) -> None:
@@ -62,7 +62,7 @@ class ResetRun:
 
 
 def run_with_resets(
-    tracker: Tracker[Frame],
+    tracker: ResettableTracker[Frame],
     frames: Iterable[Frame],
     T_gt: Iterable[Float[Array, "4 4"]],
     *,
