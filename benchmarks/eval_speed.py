@@ -147,12 +147,11 @@ def adi_by_trees(
     T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"], points_m: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, " b"]:
     """ADI with a k-d tree for each estimate: the reference of `metrics.adi`, which walks a Delaunay graph."""
-    return np.array(
-        [
-            np.mean(cKDTree(se3.apply(est, points_m)).query(se3.apply(gt, points_m))[0])
-            for est, gt in zip(T_est, T_gt, strict=True)
-        ]
-    )
+    errors_m = []
+    for est, gt in zip(T_est, T_gt, strict=True):
+        tree = cKDTree(se3.apply(est, points_m), leafsize=64, balanced_tree=False, compact_nodes=False)
+        errors_m.append(np.mean(tree.query(se3.apply(gt, points_m))[0]))
+    return np.array(errors_m)
 
 
 def rounds(work: Mapping[str, tuple[Callable[[], object], int]], count: int) -> dict[str, float]:
