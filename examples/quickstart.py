@@ -117,9 +117,9 @@ def steps(work: Path, size: Size) -> Iterator[Step]:
 
 def promises(summary: dict[str, Any]) -> list[Promise]:
     """Compare the poses of the network just trained with the start poses, by the report's numbers."""
-    quick = next(entry for entry in summary["against_start"] if entry["name"] == "quick")
+    quick = next(entry for entry in summary["against_initial"] if entry["name"] == "quick")
     vss, medians = quick["vss_mean"], quick["medians"]
-    gain = vss["refined"] - vss["start"]
+    gain = vss["refined"] - vss["reference"]
     bounds = [("median error in x", "tx_mm", 0.5), ("median error in y", "ty_mm", 0.5)]
     bounds += [("median rotation error", "re_sym_deg", 0.8)]
     # A start without error has no ratio; that keeps no promise.

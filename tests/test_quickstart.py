@@ -39,9 +39,9 @@ def test_smoke_run_ends_in_a_report_and_is_not_repeated(tmp_path: Path) -> None:
     page = work / "report" / "index.html"
     assert str(page) in first.stdout
     summary = json.loads((work / "report" / "summary.json").read_text())
-    names = [entry["name"] for entry in summary["against_start"]]
+    names = [entry["name"] for entry in summary["against_initial"]]
     assert "quick" in names
-    assert all(entry["missing"] == 0 for entry in summary["against_start"])
+    assert all(entry["missing"] == 0 for entry in summary["against_initial"])
     shown = [shlex.split(line.split("$ ", 1)[1]) for line in first.stdout.splitlines() if line.startswith("  $ ")]
     assert [words[:2] for words in shown][:3] == [["synthgen", "render"], ["synthgen", "bop"], ["refinenet", "train"]]
 
@@ -108,10 +108,10 @@ def summary_with(vss_gain: float, xy: float, rotation: float, missing: int = 0) 
     entry = {
         "name": "quick",
         "missing": missing,
-        "vss_mean": {"start": 0.6, "refined": 0.6 + vss_gain},
+        "vss_mean": {"reference": 0.6, "refined": 0.6 + vss_gain},
         "medians": {name: {"ratio": value} for name, value in ratio.items()},
     }
-    return {"against_start": [entry | {"name": "shipped"}, entry]}
+    return {"against_initial": [entry | {"name": "shipped"}, entry]}
 
 
 def test_promises_are_kept_or_missed_by_the_reports_numbers() -> None:

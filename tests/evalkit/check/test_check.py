@@ -65,7 +65,7 @@ def test_a_sound_dataset_and_its_own_poses_pass_without_a_word(root, tmp_path):
         "models": 2,
         "scenes": 2,
         "images": 3,
-        "true poses": 6,
+        "ground-truth poses": 6,
         "images decoded": 3,
         "bop19 targets": 6,
         "bop24 targets": 3,
@@ -104,7 +104,7 @@ def test_real_data_has_only_what_is_truly_wrong_in_it(shared_data):
     assert findings.counts["warning", "depth-missing"] == 4
     assert {kind for level, kind in findings.counts if level == "warning"} == {"rough-rotation", "depth-missing"}
     assert lines(findings, "hint", "file-name")
-    assert findings.covered["true poses"] == 367
+    assert findings.covered["ground-truth poses"] == 367
 
 
 def set_entry(name, im_id, index, **values):
@@ -198,26 +198,36 @@ DATASET_FAULTS = {
     "no list": (
         lambda r: change(r, GT, lambda c: c | {"4": {}}),
         "error",
-        "truth",
+        "ground-truth",
         "image 4: found a dict, expected a",
     ),
     "rotation": (
         set_entry(GT, "4", 0, cam_R_m2c=[1, 0, 0, 0, 2, 0, 0, 0, 1]),
         "error",
-        "truth",
+        "ground-truth",
         "entry 0: 'cam_R_m2c'",
     ),
-    "no id": (drop_entry(GT, "4", 1, "obj_id"), "error", "truth", "image 4, entry 1: 'obj_id' is None, expected an"),
+    "no id": (
+        drop_entry(GT, "4", 1, "obj_id"),
+        "error",
+        "ground-truth",
+        "image 4, entry 1: 'obj_id' is None, expected an",
+    ),
     "strange id": (set_entry(GT, "4", 1, obj_id=77), "error", "unknown-object", "entry 1: 'obj_id' is 77, models_info"),
     "behind": (set_entry(GT, "4", 1, cam_t_m2c=[0, 0, -500]), "error", "behind-camera", "entry 1: t_z is -500 mm"),
-    "metres": (scale_translations(0.001), "error", "units", r"median t_z of 6 true poses is 0\.5.*metres\?"),
+    "metres": (scale_translations(0.001), "error", "units", r"median t_z of 6 ground-truth poses is 0\.5.*metres\?"),
     "rough": (
         set_entry(GT, "4", 0, cam_R_m2c=[1.002, 0, 0, 0, 1.002, 0, 0, 0, 1.002]),
         "warning",
         "rough-rotation",
         r"entry 0: 'cam_R_m2c' is 0.004 from orthonormal \(scale 1.00200\)",
     ),
-    "repeated": (repeat_truth, "warning", "repeated-truth", "image 4: entries 0 and 2 are the same pose of object 1"),
+    "repeated": (
+        repeat_truth,
+        "warning",
+        "repeated-ground-truth",
+        "image 4: entries 0 and 2 are the same pose of object 1",
+    ),
     "info length": (
         lambda r: change(r, INFO, lambda c: c["4"].pop() and None),
         "error",
@@ -381,7 +391,9 @@ def test_all_faults_are_listed_not_only_the_first(root):
     for name in ("rotation", "K", "target scene", "image cut", "diameter", "share"):
         DATASET_FAULTS[name][0](root)
     findings = check(root)
-    assert {"truth", "camera", "target", "image", "diameter", "visibility"} <= {kind for _, kind in findings.counts}
+    assert {"ground-truth", "camera", "target", "image", "diameter", "visibility"} <= {
+        kind for _, kind in findings.counts
+    }
 
 
 def test_an_unknown_pose_is_no_fault(root):
@@ -520,14 +532,14 @@ def test_few_are_shown_and_all_are_counted(sound, tmp_path):
     assert "error line-line: 15 more like this; see --all" in few.output
     assert every.output.count("found 2 fields") == 25
     assert few.output.splitlines()[-1] == every.output.splitlines()[-1]
-    assert few.output.splitlines()[-1].startswith("25 errors; looked at: models 2, scenes 2, images 3")
+    assert few.output.splitlines()[-1].startswith("25 errors; checked: models 2, scenes 2, images 3")
 
 
 def test_the_command_ends_with_1_on_errors_only(root, tmp_path):
     out = tmp_path / "check.json"
     good = CliRunner().invoke(command, [str(root), "--json", str(out)])
     assert good.exit_code == 0, good.output
-    assert good.output.startswith("nothing wrong; looked at: models 2")
+    assert good.output.startswith("nothing wrong; checked: models 2")
     assert json.loads(out.read_text())["ok"] is True
     DATASET_FAULTS["blank"][0](root)
     assert CliRunner().invoke(command, [str(root)]).exit_code == 0
@@ -548,4 +560,4 @@ def test_samples_bound_the_images_that_are_decoded(root):
 
 
 def test_findings_say_that_nothing_was_wrong():
-    assert Findings().summary() == "nothing wrong; looked at: nothing"
+    assert Findings().summary() == "nothing wrong; checked: nothing"

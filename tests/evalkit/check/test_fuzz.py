@@ -72,8 +72,8 @@ def sound(tmp_path_factory):
     info["1"].pop("symmetries_continuous")
     (root / "models/models_info.json").write_text(json.dumps(info))
     dataset = BopDataset(root)
-    truths = [(s, i, gt) for s, i in IMAGES for gt in dataset.gt(s, i)]
-    poses = [Estimate(scene_id=s, im_id=i, obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj) for s, i, gt in truths]
+    instances = [(s, i, gt) for s, i in IMAGES for gt in dataset.gt(s, i)]
+    poses = [Estimate(scene_id=s, im_id=i, obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj) for s, i, gt in instances]
     write_results(folder / "poses_cubes-test.csv", poses * 2)
     return root
 
@@ -197,13 +197,13 @@ def use(root):
             camera = dataset.camera(scene_id, im_id)
             assert np.isfinite(camera.K).all()
             assert camera.K[0, 0] > 0
-            for truth in dataset.gt(scene_id, im_id):
-                assert isinstance(truth.obj_id, int)
-                assert truth.visib_fract is None or 0 <= truth.visib_fract <= 1
-                if truth.has_pose:
-                    assert se3.is_rotation(truth.T_cam_obj[:3, :3], 2e-2)
-                    assert np.abs(truth.T_cam_obj).max() <= 1e6
-                dataset.mask(scene_id, im_id, truth.gt_index)
+            for gt in dataset.gt(scene_id, im_id):
+                assert isinstance(gt.obj_id, int)
+                assert gt.visib_fract is None or 0 <= gt.visib_fract <= 1
+                if gt.has_pose:
+                    assert se3.is_rotation(gt.T_cam_obj[:3, :3], 2e-2)
+                    assert np.abs(gt.T_cam_obj).max() <= 1e6
+                dataset.mask(scene_id, im_id, gt.gt_index)
             depth_m = dataset.depth_m(scene_id, im_id)
             assert depth_m is None or (np.isfinite(depth_m).all() and depth_m.min() >= 0)
 

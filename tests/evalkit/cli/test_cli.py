@@ -19,14 +19,14 @@ def run(*arguments):
     return CliRunner().invoke(main, [str(argument) for argument in arguments], catch_exceptions=False)
 
 
-def refined_from(starts, dataset, share):
+def refined_from(initial_poses, dataset, share):
     """Start poses with their rotation and translation error multiplied by `share`."""
     better = []
-    for start in starts:
-        truth = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id)
-        dR, dt = se3.update_between(truth.T_cam_obj, start.T_cam_obj)
+    for start in initial_poses:
+        gt = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id)
+        dR, dt = se3.update_between(gt.T_cam_obj, start.T_cam_obj)
         R = se3.rotation_from_rotvec(se3.rotvec_from_rotation(dR) * share)
-        better.append(replace(start, T_cam_obj=se3.apply_update(truth.T_cam_obj, R, dt * share)))
+        better.append(replace(start, T_cam_obj=se3.apply_update(gt.T_cam_obj, R, dt * share)))
     return better
 
 
@@ -49,13 +49,13 @@ def test_report_without_arguments(work):
     assert result.exit_code == 0, result.output
     summary = json.loads((work / "report/summary.json").read_text())
     assert [file["name"] for file in summary["files"]] == ["start", "quick"]
-    (against,) = summary["against_start"]
+    (against,) = summary["against_initial"]
     assert (against["poses"], against["missing"]) == (5, 1)
     assert against["medians"]["re_sym_deg"]["ratio"] == pytest.approx(0.25, rel=0.2)
     assert against["medians"]["tz_mm"]["ratio"] == pytest.approx(0.25, rel=1e-3)
     assert against["words"] in result.output
     assert "1 pose is missing in quick" in against["words"]
-    assert "z error down to 0.25 of the start's" in against["words"]
+    assert "z error down to 0.25 of the initial one" in against["words"]
 
 
 def test_the_page_stands_alone_and_says_what_it_measured(work):
@@ -114,8 +114,8 @@ def test_perturbation_levels_are_exact_and_recorded(work):
     assert len(estimates) == len(rows) == 6 * 6
     for row, estimate in zip(rows, estimates, strict=True):
         assert row["line"] == estimate.line
-        truth = dataset.gt(estimate.scene_id, estimate.im_id)[row["gt_index"]]
-        dR, dt = se3.update_between(truth.T_cam_obj, estimate.T_cam_obj)
+        gt = dataset.gt(estimate.scene_id, estimate.im_id)[row["gt_index"]]
+        dR, dt = se3.update_between(gt.T_cam_obj, estimate.T_cam_obj)
         diameter_m = dataset.models_info[estimate.obj_id].diameter_m
         assert np.rad2deg(se3.rotation_angle_rad(dR)) == pytest.approx(row["angle_deg"], abs=1e-4)
         assert np.linalg.norm(dt) == pytest.approx(row["translation_diameter"] * diameter_m, abs=1e-8)
@@ -138,7 +138,7 @@ def test_curves_by_level(work):
     result = run("report", "--dataset", "test_bop", *files)
     assert result.exit_code == 0, result.output
     start, refined = json.loads((work / "report/summary.json").read_text())["files"]
-    assert start["is_start"]
+    assert start["is_initial"]
     angle = {point["level"]: point for point in refined["by_level"]["angle"]}
     assert [angle[level]["under_10deg"] for level in (10.0, 40.0, 60.0)] == [1.0, 0.0, 0.0]
     assert angle[10.0]["re_sym_deg_mean"] <= 5.0 + 1e-3
@@ -148,7 +148,7 @@ def test_curves_by_level(work):
     translation = {point["level"]: point for point in start["by_level"]["translation"]}
     assert [translation[level]["diverged"] for level in (0.1, 0.5, 0.8)] == [0.0, 0.0, 1.0]
     page = (work / "report/index.html").read_text()
-    assert "From perturbed starts" in page
+    assert "From perturbed initial poses" in page
     assert page.count("<figure><figcaption>Diverged") == 2
 
 
@@ -156,7 +156,7 @@ def test_curves_by_level(work):
     ("arguments", "code", "message"),
     [
         (["report", "--dataset", "nowhere", "--results", "results/quick.csv"], 1, "nowhere: no such folder"),
-        (["report", "--results", "absent.csv"], 2, "absent.csv: no sidecar says which dataset"),
+        (["report", "--results", "absent.csv"], 2, "absent.csv: no sidecar names the dataset"),
         (["report", "--dataset", "test_bop", "--results", "absent.csv"], 1, "absent.csv: cannot be read"),
         (
             ["report", "--dataset", "test_bop", "--results", "results/quick.csv", "--results", "results/quick.csv"],
@@ -233,7 +233,7 @@ def test_an_error_of_the_system_is_one_line(work, monkeypatch):
     def unreadable(*_, **__):
         raise PermissionError(13, "Permission denied", "test_bop/scene_gt.json")
 
-    monkeypatch.setattr(importlib.import_module("evalkit.report.write"), "write_report", unreadable)
+    monkeypatch.setattr(importlib.import_module("evalkit.report.job"), "make_report", unreadable)
     result = run("report")
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: test_bop/scene_gt.json: no permission")

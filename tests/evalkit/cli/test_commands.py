@@ -35,7 +35,10 @@ def test_a_sound_dataset_and_file_pass(work):
     result = run("check", "toys", "truth.csv", "--json", "check.json")
     assert result.exit_code == 0, result.output
     assert "error" not in result.output
-    assert "true poses 6, images decoded 3, poses against themselves 6, result files 1, estimates 6" in result.output
+    assert (
+        "ground-truth poses 6, images decoded 3, poses against themselves 6, result files 1, estimates 6"
+        in result.output
+    )
     assert json.loads((work / "check.json").read_text())["counts"] | {"hint": 0} == {
         "error": 0,
         "warning": 0,

@@ -13,7 +13,8 @@ from evalkit.cli import main
 from evalkit.diff import COUNTS, MEASURES, Side, Sides, differences, judge, open_sides, parse_rule
 from evalkit.diff.deltas import paired_rows
 from evalkit.diff.rules import OPERATORS, STATISTICS
-from evalkit.report.write import estimates_csv
+from evalkit.diff.sides import read_errors
+from evalkit.report.job import estimates_csv
 from posecore import se3
 from posecore.bop import write_results
 from posecore.errors import ConfigError
@@ -120,8 +121,11 @@ def test_newly_failed_come_with_the_largest_changes_first(tmp_path):
 
 
 def test_poses_are_paired_by_instance_and_start_whatever_their_order(tmp_path):
-    starts = {"start_angle_deg": [5.0, 10.0, 5.0, NAN, NAN], "start_translation_diameter": [0.0, 0.0, 0.0, NAN, NAN]}
-    a = errors_table(5, im_id=[0, 0, 1, 1, 1], vss=[0.1, 0.2, 0.3, 0.4, 0.5], **starts)
+    initial_poses = {
+        "initial_angle_deg": [5.0, 10.0, 5.0, NAN, NAN],
+        "initial_translation_diameter": [0.0, 0.0, 0.0, NAN, NAN],
+    }
+    a = errors_table(5, im_id=[0, 0, 1, 1, 1], vss=[0.1, 0.2, 0.3, 0.4, 0.5], **initial_poses)
     b = a.iloc[[2, 0, 3, 1, 4]].reset_index(drop=True)
     rows_a, rows_b = paired_rows(a, b)
     np.testing.assert_array_equal(a.vss.to_numpy()[rows_a], b.vss.to_numpy()[rows_b])
@@ -241,7 +245,7 @@ def test_a_report_table_of_several_files_needs_their_names(tmp_path):
     a = write_errors(tmp_path / "estimates.csv", start=errors_table(3, vss=0.5), fine=errors_table(3, vss=0.75))
     result = run("diff", a, a)
     assert result.exit_code == 2
-    assert "holds start, fine; say which with --result-a and --result-b" in result.stderr
+    assert "holds start, fine; name one with --result-a and --result-b" in result.stderr
     result = run("diff", a, a, "--result-a", "start", "--result-b", "fine", "--json", tmp_path / "d.json")
     assert result.exit_code == 0
     content = json.loads((tmp_path / "d.json").read_text())
@@ -358,3 +362,15 @@ def test_one_file_against_itself_is_all_zero(results):
     assert result.exit_code == 0, result.output
     assert "good (A)" in result.stdout
     assert "good (B)" in result.stdout
+
+
+def test_error_tables_of_earlier_versions_are_read(tmp_path):
+    table = errors_table(3, initial_angle_deg=[5.0, 10.0, 15.0], initial_translation_diameter=0.0)
+    path = write_errors(tmp_path / "estimates.csv", refined=table)
+    head, rest = path.read_text().split("\n", 1)
+    old = head.replace("initial_angle_deg", "start_angle_deg").replace("initial_trans", "start_trans")
+    assert old != head
+    path.write_text(f"{old}\n{rest}")
+    read = read_errors(path).table
+    assert read.initial_angle_deg.tolist() == [5.0, 10.0, 15.0]
+    assert read.initial_translation_diameter.tolist() == [0.0] * 3

@@ -13,12 +13,12 @@ import pytest
 from evalkit.error_table import column, table_of
 from evalkit.evaluation.evaluator import Evaluator
 from evalkit.evaluation.scored_file import Scored
-from evalkit.inputs.pairing import Pair, pair_up
+from evalkit.inputs.pairing import MatchedPose, pair_up
 from evalkit.inputs.result_files import ResultFile, load_result_files
 from evalkit.pose_errors import silhouettes
 from evalkit.pose_errors.metrics import vss
 from evalkit.pose_errors.silhouettes import Patch
-from evalkit.report.summary import start_of
+from evalkit.report.summary import initial_of
 from evalkit.scores import by_object, scores
 from evalkit.scores.convergence import by_level
 from posecore import se3
@@ -55,8 +55,8 @@ def test_values_do_not_depend_on_workers_or_blocks(dataset, perfect, monkeypatch
     rng = np.random.default_rng(1)
     moved = [replace(e, T_cam_obj=se3.perturb(e.T_cam_obj, 0.2, 0.02, rng)) for e in perfect for _ in range(7)]
     pairs = pair_up(dataset, in_memory(perfect[:5])).pairs
-    truths = {(pair.scene_id, pair.im_id, pair.truth.obj_id): pair for pair in pairs}
-    pairs += [replace(truths[e.scene_id, e.im_id, e.obj_id], estimate=e) for e in rng.permutation(moved)]
+    instances = {(pair.scene_id, pair.im_id, pair.gt.obj_id): pair for pair in pairs}
+    pairs += [replace(instances[e.scene_id, e.im_id, e.obj_id], estimate=e) for e in rng.permutation(moved)]
     done = []
     with Evaluator(dataset) as one, Evaluator(dataset, workers=2) as two:
         whole = one.evaluate(pairs, done.append)
@@ -98,7 +98,7 @@ def test_known_errors_are_not_computed_again(dataset, perfect, monkeypatch):
         scored = []
         plain = evaluator._scorer.score
         monkeypatch.setattr(evaluator._scorer, "score", lambda block: scored.extend(block) or plain(block))
-        reused = evaluator.all_errors(again, known=(pairs, table))
+        reused = evaluator.all_errors(again, scored=(pairs, table))
     pd.testing.assert_frame_equal(reused.errors, anew.errors, check_exact=True)
     assert [pair.estimate.score for pair in scored] == [0.1]
 
@@ -156,9 +156,9 @@ def test_instances_take_the_nearest_free_truth(dataset_path, tmp_path):
         for score, gt in ((0.9, third), (0.8, first))
     ]
     pairs = pair_up(dataset, in_memory(estimates)).pairs
-    assert {(pair.truth.gt_index, pair.estimate.score) for pair in pairs} == {(2, 0.9), (0, 0.8)}
+    assert {(pair.gt.gt_index, pair.estimate.score) for pair in pairs} == {(2, 0.9), (0, 0.8)}
     pairs = pair_up(dataset, in_memory(estimates[:1])).pairs
-    assert [(pair.truth.gt_index, pair.estimate is None) for pair in pairs] == [(2, False), (0, True)]
+    assert [(pair.gt.gt_index, pair.estimate is None) for pair in pairs] == [(2, False), (0, True)]
 
 
 def test_target_without_truth_is_an_error(dataset_path, tmp_path, perfect):
@@ -228,13 +228,13 @@ def test_vss_of_patches_is_vss_of_frames():
 
 
 def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
-    truth = perfect[0]
+    gt = perfect[0]
     rows = [
         {
             "line": 2 + index,
-            "scene_id": truth.scene_id,
-            "im_id": truth.im_id,
-            "obj_id": truth.obj_id,
+            "scene_id": gt.scene_id,
+            "im_id": gt.im_id,
+            "obj_id": gt.obj_id,
             "gt_index": 0,
             "angle_deg": angle,
             "translation_diameter": 0.0,
@@ -243,12 +243,12 @@ def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
         for index, angle in enumerate((5.0, 10.0, 20.0))
     ]
     block = {"perturbation": {"rows": rows}}
-    in_order = pair_up(dataset, in_memory([truth] * 3, block)).pairs
+    in_order = pair_up(dataset, in_memory([gt] * 3, block)).pairs
     assert [pair.level.angle_deg for pair in in_order] == [5.0, 10.0, 20.0]
-    two = pair_up(dataset, in_memory([truth] * 2, block | {"initial_lines": [4, 2]})).pairs
+    two = pair_up(dataset, in_memory([gt] * 2, block | {"initial_lines": [4, 2]})).pairs
     assert [pair.estimate is None for pair in two] == [False, True, False]
-    with pytest.raises(ResultFileError, match="2 estimates of object 1 in scene 4, image 0, but 3 starts"):
-        pair_up(dataset, in_memory([truth] * 2, block))
+    with pytest.raises(ResultFileError, match="2 estimates of object 1 in scene 4, image 0, but 3 initial poses"):
+        pair_up(dataset, in_memory([gt] * 2, block))
     with Evaluator(dataset) as evaluator:
         curve = by_level(evaluator.evaluate(two))["angle"]
     assert [(point["level"], point["under_5deg"], point["diverged"]) for point in curve] == [
@@ -264,10 +264,10 @@ def test_a_file_is_compared_with_the_start_poses_it_came_from():
         none = np.zeros((0, 4, 4))
         return Scored(file=file, table=table_of({}), T_est=none, T_gt=none, ignored=0)
 
-    starts = [scored("near", method="start"), scored("far", method="start")]
-    assert start_of(scored("a", init="far.csv"), starts) is starts[1]
-    assert start_of(scored("b", init="gone.csv"), starts) is starts[0]
-    assert start_of(scored("c"), starts) is starts[0]
+    initial_poses = [scored("near", method="initial"), scored("far", method="initial")]
+    assert initial_of(scored("a", init="far.csv"), initial_poses) is initial_poses[1]
+    assert initial_of(scored("b", init="gone.csv"), initial_poses) is initial_poses[0]
+    assert initial_of(scored("c"), initial_poses) is initial_poses[0]
 
 
 def test_a_ball_is_scored_without_sampling_error(dataset_path, tmp_path, perfect):
@@ -280,12 +280,12 @@ def test_a_ball_is_scored_without_sampling_error(dataset_path, tmp_path, perfect
     file.write_text(json.dumps(info))
     dataset = BopDataset(root)
     rng = np.random.default_rng(0)
-    truth = next(gt for gt in dataset.gt(*IMAGES[0]) if gt.obj_id == TUG)
-    turned = se3.make_T(se3.random_rotation(rng), truth.T_cam_obj[:3, 3])
+    gt = next(gt for gt in dataset.gt(*IMAGES[0]) if gt.obj_id == TUG)
+    turned = se3.make_T(se3.random_rotation(rng), gt.T_cam_obj[:3, 3])
     estimate = replace(perfect[0], T_cam_obj=turned, obj_id=TUG)
-    pair = Pair(scene_id=IMAGES[0][0], im_id=IMAGES[0][1], truth=truth, estimate=estimate)
+    pair = MatchedPose(scene_id=IMAGES[0][0], im_id=IMAGES[0][1], gt=gt, estimate=estimate)
     with Evaluator(dataset) as evaluator:
         row = evaluator.evaluate([pair]).iloc[0]
     assert row.mssd_m < 1e-9
     assert row.re_sym_rad < 1e-6
-    assert isinstance(truth, GroundTruth)
+    assert isinstance(gt, GroundTruth)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from evalkit.cli import main
-from evalkit.inputs.perturbation import PROTOCOLS, departures
+from evalkit.inputs.perturbation import PROTOCOLS, protocol_deviations
 from posecore.bop import BopDataset, read_results, read_sidecar
 
 
@@ -49,8 +49,8 @@ def test_levels_without_a_protocol_name_none(dataset_path, tmp_path):
 
 def test_too_few_iterations_depart_from_the_papers_protocol():
     sidecar = {"perturbation": {"protocol": "paper", "rows": []}, "settings": {"iterations": 5}}
-    assert departures(sidecar) == ["refined in 5 iterations, while protocol 'paper' asks for 10"]
-    assert departures(sidecar | {"settings": {"iterations": 10}}) == []
+    assert protocol_deviations(sidecar) == ["refined in 5 iterations, while protocol 'paper' asks for 10"]
+    assert protocol_deviations(sidecar | {"settings": {"iterations": 10}}) == []
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_too_few_iterations_depart_from_the_papers_protocol():
     ],
 )
 def test_what_names_no_protocol_departs_from_none(sidecar):
-    assert departures(sidecar) == []
+    assert protocol_deviations(sidecar) == []
 
 
 def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(dataset_path, tmp_path):
@@ -77,12 +77,12 @@ def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(
     rows = read_sidecar(tmp_path / "stretched.csv")["perturbation"]["rows"]
     assert len(plain) == len(stretched) == len(rows) == 12
     for before, after, row in zip(plain, stretched, rows, strict=True):
-        truth = dataset.gt(before.scene_id, before.im_id)[row["gt_index"]].T_cam_obj
+        gt = dataset.gt(before.scene_id, before.im_id)[row["gt_index"]].T_cam_obj
         if not row["random"]:
             assert np.array_equal(before.T_cam_obj, after.T_cam_obj)
             continue
-        ray = truth[:3, 3] / np.linalg.norm(truth[:3, 3])
-        move, moved = (one.T_cam_obj[:3, 3] - truth[:3, 3] for one in (before, after))
+        ray = gt[:3, 3] / np.linalg.norm(gt[:3, 3])
+        move, moved = (one.T_cam_obj[:3, 3] - gt[:3, 3] for one in (before, after))
         assert moved @ ray == pytest.approx(4 * (move @ ray), abs=1e-8)
         assert np.cross(moved, ray) == pytest.approx(np.cross(move, ray), abs=1e-8)
         assert np.array_equal(before.T_cam_obj[:3, :3], after.T_cam_obj[:3, :3])
@@ -90,4 +90,4 @@ def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(
         assert row["translation_diameter"] == pytest.approx(np.linalg.norm(moved) / diameter_m, abs=1e-6)
     without = perturb("--dataset", dataset_path, "--out", tmp_path / "x.csv", "--angles", "5", "--depth-stretch", "4")
     assert without.exit_code == 2
-    assert without.stderr == "Error: --depth-stretch is for random starts; give --random-translation too\n"
+    assert without.stderr == "Error: --depth-stretch needs a random initial pose; give --random-translation too\n"

@@ -6,7 +6,7 @@ Objects are regular polygons of points and square plates: their distances, proje
 import numpy as np
 import pytest
 from evalkit.evaluation.evaluator import Evaluator
-from evalkit.inputs.pairing import Pair
+from evalkit.inputs.pairing import MatchedPose
 from evalkit.pose_errors import metrics
 from evalkit.scores import scores
 from posecore import se3
@@ -45,14 +45,14 @@ def test_a_translation_is_its_length_in_add_mssd_and_te(seed):
     """Every point moves by the same vector; none gets nearer to another true point than that, so ADI is no larger."""
     rng = np.random.default_rng(seed)
     points_m, t = rng.uniform(-0.05, 0.05, (30, 3)), rng.normal(size=3) * 0.02
-    truth = pose(seed)
-    estimate = moved(truth, *t)
+    gt = pose(seed)
+    estimate = moved(gt, *t)
     length = pytest.approx(np.linalg.norm(t), abs=1e-12)
-    assert metrics.add(estimate, truth, points_m) == length
-    assert metrics.mssd(estimate, truth, points_m, np.eye(4)[None]) == length
-    assert metrics.te(estimate, truth) == length
-    assert metrics.adi(estimate, truth, points_m) <= np.linalg.norm(t) + 1e-12
-    assert metrics.te_axes(estimate, truth) == pytest.approx(t, abs=1e-12)
+    assert metrics.add(estimate, gt, points_m) == length
+    assert metrics.mssd(estimate, gt, points_m, np.eye(4)[None]) == length
+    assert metrics.te(estimate, gt) == length
+    assert metrics.adi(estimate, gt, points_m) <= np.linalg.norm(t) + 1e-12
+    assert metrics.te_axes(estimate, gt) == pytest.approx(t, abs=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -60,13 +60,13 @@ def test_a_rotation_moves_points_along_chords(seed):
     """About an axis through the origin a point at distance r from it moves along a chord of 2 r sin(angle / 2)."""
     rng = np.random.default_rng(seed)
     points_m, axis, angle = rng.uniform(-0.05, 0.05, (30, 3)), se3.random_direction(rng), rng.uniform(0, np.pi)
-    truth = pose(seed)
-    estimate = truth @ rotations_about_axis(axis, np.array([angle]), ORIGIN)[0]
+    gt = pose(seed)
+    estimate = gt @ rotations_about_axis(axis, np.array([angle]), ORIGIN)[0]
     chords = 2 * np.linalg.norm(np.cross(axis, points_m), axis=1) * np.sin(angle / 2)
-    assert metrics.add(estimate, truth, points_m) == pytest.approx(chords.mean(), abs=1e-12)
-    assert metrics.mssd(estimate, truth, points_m, np.eye(4)[None]) == pytest.approx(chords.max(), abs=1e-12)
-    assert metrics.re(estimate, truth) == pytest.approx(angle, abs=1e-7)
-    assert metrics.te(estimate, truth) == pytest.approx(0, abs=1e-12)
+    assert metrics.add(estimate, gt, points_m) == pytest.approx(chords.mean(), abs=1e-12)
+    assert metrics.mssd(estimate, gt, points_m, np.eye(4)[None]) == pytest.approx(chords.max(), abs=1e-12)
+    assert metrics.re(estimate, gt) == pytest.approx(angle, abs=1e-7)
+    assert metrics.te(estimate, gt) == pytest.approx(0, abs=1e-12)
 
 
 @pytest.mark.parametrize("corners", range(3, 13))
@@ -80,26 +80,26 @@ def test_a_regular_polygon_turned_in_its_plane(corners, steps, rest):
     step = 2 * np.pi / corners
     points_m = polygon(corners, 0.05)
     symmetries = turn_z(*(step * np.arange(corners)))
-    truth = pose(corners)
+    gt = pose(corners)
     angle = steps * step + rest
-    estimate = truth @ turn_z(angle)[0]
+    estimate = gt @ turn_z(angle)[0]
     chord = 2 * 0.05 * np.sin(abs(rest) / 2)
-    assert metrics.add(estimate, truth, points_m) == pytest.approx(2 * 0.05 * abs(np.sin(angle / 2)), abs=1e-12)
-    assert metrics.adi(estimate, truth, points_m) == pytest.approx(chord, abs=1e-12)
-    assert metrics.mssd(estimate, truth, points_m, symmetries) == pytest.approx(chord, abs=1e-12)
-    assert metrics.re_symmetric(estimate, truth, symmetries) == pytest.approx(abs(rest), abs=1e-7)
-    assert metrics.re(estimate, truth) == pytest.approx(abs((angle + np.pi) % (2 * np.pi) - np.pi), abs=1e-7)
+    assert metrics.add(estimate, gt, points_m) == pytest.approx(2 * 0.05 * abs(np.sin(angle / 2)), abs=1e-12)
+    assert metrics.adi(estimate, gt, points_m) == pytest.approx(chord, abs=1e-12)
+    assert metrics.mssd(estimate, gt, points_m, symmetries) == pytest.approx(chord, abs=1e-12)
+    assert metrics.re_symmetric(estimate, gt, symmetries) == pytest.approx(abs(rest), abs=1e-7)
+    assert metrics.re(estimate, gt) == pytest.approx(abs((angle + np.pi) % (2 * np.pi) - np.pi), abs=1e-7)
 
 
 @pytest.mark.parametrize("angle", np.linspace(0, 2 * np.pi, 30))
 def test_a_ring_turned_about_its_axis(angle):
     """A continuous symmetry is sampled at steps: half of one is left at most, as an angle and along the rim."""
     info = ModelInfo(diameter_m=0.1, symmetries_continuous=(ContinuousSymmetry((0.0, 0.0, 1.0), (0.0, 0.0, 0.0)),))
-    symmetries, points_m, truth = symmetry_transforms(info), polygon(200, 0.05), pose(3)
+    symmetries, points_m, gt = symmetry_transforms(info), polygon(200, 0.05), pose(3)
     half_step = np.pi / len(symmetries)
-    estimate = truth @ turn_z(angle)[0]
-    assert metrics.re_symmetric(estimate, truth, symmetries) <= half_step + 1e-9
-    assert metrics.mssd(estimate, truth, points_m, symmetries) <= 2 * 0.05 * np.sin(half_step / 2) + 1e-12
+    estimate = gt @ turn_z(angle)[0]
+    assert metrics.re_symmetric(estimate, gt, symmetries) <= half_step + 1e-9
+    assert metrics.mssd(estimate, gt, points_m, symmetries) <= 2 * 0.05 * np.sin(half_step / 2) + 1e-12
 
 
 @pytest.mark.parametrize("seed", range(60))
@@ -111,21 +111,21 @@ def test_projections_of_a_plate_that_faces_the_camera(seed):
     rng = np.random.default_rng(seed)
     half, z, z_other, d = rng.uniform(0.01, 0.1), rng.uniform(0.3, 2), rng.uniform(0.3, 2), rng.uniform(0, 0.1)
     corners_m = half * np.array([[1.0, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0]])
-    truth = se3.make_T(np.eye(3), np.array([0, 0, z]))
-    sideways, deeper = moved(truth, x=d), moved(truth, z=z_other - z)
+    gt = se3.make_T(np.eye(3), np.array([0, 0, z]))
+    sideways, deeper = moved(gt, x=d), moved(gt, z=z_other - z)
     one = np.eye(4)[None]
-    assert metrics.mspd(sideways, truth, K, corners_m, one) == pytest.approx(400 * d / z, abs=1e-9)
-    assert metrics.proj(sideways, truth, K, corners_m) == pytest.approx(400 * d / z, abs=1e-9)
+    assert metrics.mspd(sideways, gt, K, corners_m, one) == pytest.approx(400 * d / z, abs=1e-9)
+    assert metrics.proj(sideways, gt, K, corners_m) == pytest.approx(400 * d / z, abs=1e-9)
     out = 400 * half * np.sqrt(2) * abs(1 / z - 1 / z_other)
-    assert metrics.mspd(deeper, truth, K, corners_m, one) == pytest.approx(out, abs=1e-9)
-    assert metrics.proj(deeper, truth, K, corners_m) == pytest.approx(out, abs=1e-9)
+    assert metrics.mspd(deeper, gt, K, corners_m, one) == pytest.approx(out, abs=1e-9)
+    assert metrics.proj(deeper, gt, K, corners_m) == pytest.approx(out, abs=1e-9)
 
 
 def test_projections_from_behind_the_camera_are_mirrored():
     """As in bop_toolkit: at -z a point X projects to where -X would at z, so both corners at +-X swap places."""
     ends_m = np.array([[0.05, 0.0, 0.0], [-0.05, 0.0, 0.0]])
-    truth, behind = (se3.make_T(np.eye(3), np.array([0, 0, z])) for z in (0.5, -0.5))
-    assert metrics.mspd(behind, truth, K, ends_m, np.eye(4)[None]) == pytest.approx(2 * 400 * 0.05 / 0.5)
+    gt, behind = (se3.make_T(np.eye(3), np.array([0, 0, z])) for z in (0.5, -0.5))
+    assert metrics.mspd(behind, gt, K, ends_m, np.eye(4)[None]) == pytest.approx(2 * 400 * 0.05 / 0.5)
 
 
 PLATE = 9
@@ -163,9 +163,9 @@ def plates(tmp_path_factory):
 
 
 def plate_rows(plates, poses, kind="full"):
-    truth = plates.gt(1, 0)[0]
+    gt = plates.gt(1, 0)[0]
     pairs = [
-        Pair(scene_id=1, im_id=0, truth=truth, estimate=Estimate(scene_id=1, im_id=0, obj_id=PLATE, T_cam_obj=T))
+        MatchedPose(scene_id=1, im_id=0, gt=gt, estimate=Estimate(scene_id=1, im_id=0, obj_id=PLATE, T_cam_obj=T))
         for T in poses
     ]
     with Evaluator(plates, kind) as evaluator:
@@ -245,7 +245,7 @@ def test_truth_under_any_of_its_symmetries_scores_perfectly(tmp_path, tug_ply, b
         for gt in dataset.gt(scene_id, im_id):
             for S in symmetry_transforms(dataset.models_info[gt.obj_id]):
                 estimate = Estimate(scene_id=scene_id, im_id=im_id, obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj @ S)
-                pairs.append(Pair(scene_id=scene_id, im_id=im_id, truth=gt, estimate=estimate))
+                pairs.append(MatchedPose(scene_id=scene_id, im_id=im_id, gt=gt, estimate=estimate))
     with Evaluator(dataset) as evaluator:
         rows = evaluator.evaluate(pairs)
     assert len(rows) > 900

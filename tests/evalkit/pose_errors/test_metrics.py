@@ -157,8 +157,8 @@ def test_batches_and_single_poses_follow_the_definitions(symmetric):
         }
 
     batch, hull = errors(T_est, T_gt), metrics.mssd(T_est, T_gt, per_object.hull(POINTS), symmetries)
-    for index, (estimate, truth) in enumerate(zip(T_est, T_gt, strict=True)):
-        expected, single = plain_errors(estimate, truth, POINTS, symmetries), errors(estimate, truth)
+    for index, (estimate, gt) in enumerate(zip(T_est, T_gt, strict=True)):
+        expected, single = plain_errors(estimate, gt, POINTS, symmetries), errors(estimate, gt)
         for name, value in expected.items():
             assert batch[name][index] == pytest.approx(value, abs=1e-10)
             assert single[name].shape == ()

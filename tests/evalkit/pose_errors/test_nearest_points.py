@@ -29,8 +29,8 @@ def poses(seed, count=40):
 
 def tree_distances(T_est, T_gt, points_m):
     return [
-        cKDTree(se3.apply(estimate, points_m)).query(se3.apply(truth, points_m))[0].mean()
-        for estimate, truth in zip(T_est, T_gt, strict=True)
+        cKDTree(se3.apply(estimate, points_m)).query(se3.apply(gt, points_m))[0].mean()
+        for estimate, gt in zip(T_est, T_gt, strict=True)
     ]
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from evalkit import evaluate
 from evalkit.pose_errors import metrics
+from evalkit.pose_errors.metrics import VSD_COLUMNS, VSD_TAUS
 from evalkit.scores import scores
-from evalkit.scores.definitions import VSD_COLUMNS, VSD_TAUS
 from posecore.bop import write_results
 
 

@@ -27,20 +27,20 @@ def pages(tmp_path_factory, dataset_path):
     """A report and a comparison of starts with the same moved half way to the truth."""
     work = tmp_path_factory.mktemp("pages")
     shutil.copytree(dataset_path, work / "toys")
-    starts = work / "start.csv"
-    run("perturb", "--dataset", work / "toys", "--out", starts, "--angles", "5,10,20", "--translations", "0.1")
+    initial_poses = work / "start.csv"
+    run("perturb", "--dataset", work / "toys", "--out", initial_poses, "--angles", "5,10,20", "--translations", "0.1")
     dataset, better = BopDataset(work / "toys"), []
-    for start in read_results(starts):
-        truth = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id).T_cam_obj
-        dR, dt = se3.update_between(start.T_cam_obj, truth)
+    for start in read_results(initial_poses):
+        gt = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id).T_cam_obj
+        dR, dt = se3.update_between(start.T_cam_obj, gt)
         half = se3.rotation_from_rotvec(se3.rotvec_from_rotation(dR) / 2)
         better.append(replace(start, T_cam_obj=se3.apply_update(start.T_cam_obj, half, dt / 2)))
-    lines = [start.line for start in read_results(starts)]
+    lines = [start.line for start in read_results(initial_poses)]
     sidecar = {"method": "half", "init": "start.csv", "initial_lines": lines}
     write_results(work / "half.csv", better, sidecar)
     named = ("--dataset", work / "toys")
-    run("report", *named, "--results", starts, "--results", work / "half.csv", "--out", work / "report")
-    run("diff", starts, work / "half.csv", *named, "--html", work / "diff.html")
+    run("report", *named, "--results", initial_poses, "--results", work / "half.csv", "--out", work / "report")
+    run("diff", initial_poses, work / "half.csv", *named, "--html", work / "diff.html")
     return work / "report" / "index.html", work / "diff.html"
 
 

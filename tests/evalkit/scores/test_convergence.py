@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from error_tables import errors_table
-from evalkit.scores.convergence import by_level, by_level_and_object, level_object_tables, level_tables
+from evalkit.scores.convergence import by_level, by_level_and_object
+from evalkit.tables.convergence import level_object_tables, level_tables
 from evalkit.tables.model import Interval
 
 
@@ -12,14 +13,16 @@ def level(angle, rotation_deg, **columns):
     """Starts rotated by `angle`, with these final rotation errors (NaN: missing)."""
     rotation = np.deg2rad(np.array(rotation_deg, np.float64))
     found = ~np.isnan(rotation)
-    rest = {"start_translation_diameter": 0.0, "te_m": 0.0} | columns
-    return errors_table(len(rotation), found=found, start_angle_deg=angle, re_rad=rotation, re_sym_rad=rotation, **rest)
+    rest = {"initial_translation_diameter": 0.0, "te_m": 0.0} | columns
+    return errors_table(
+        len(rotation), found=found, initial_angle_deg=angle, re_rad=rotation, re_sym_rad=rotation, **rest
+    )
 
 
 def moved(share, te_diameters, **columns):
     """Starts moved by `share` diameters of 0.1 m, with these final translation errors in diameters."""
     te = np.array(te_diameters, np.float64) * 0.1
-    return errors_table(len(te), start_translation_diameter=share, start_angle_deg=0.0, te_m=te, **columns)
+    return errors_table(len(te), initial_translation_diameter=share, initial_angle_deg=0.0, te_m=te, **columns)
 
 
 def test_shares_are_of_all_starts_and_means_are_of_found_ones():

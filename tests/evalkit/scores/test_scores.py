@@ -4,35 +4,36 @@ import numpy as np
 import pandas as pd
 import pytest
 from error_tables import errors_table
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores import (
     DEFINITIONS,
     AllErrors,
-    bop19_shares,
+    bop19_recalls,
     bop24_precision,
     by_object,
     scores,
     solved,
     with_bop19,
 )
-from evalkit.scores.bop_matching import average_precision, greedy_matches, ranks, target_truths
-from evalkit.scores.definitions import MSPD_PX, MSSD_DIAMETERS, VSD_COLUMNS, VSD_LIMITS
+from evalkit.scores.bop_matching import average_precision, greedy_matches, ranks, target_instances
+from evalkit.scores.definitions import MSPD_PX, MSSD_DIAMETERS, VSD_LIMITS
 from evalkit.scores.per_pose import under
 
 NAN = float("nan")
 
 
-def everything(truths, estimates, errors):
+def everything(instances, estimates, errors):
     """`AllErrors` from short rows: truths (scene, image, object, visible, asked), estimates (scene, image, object,
     score), errors (estimate, truth, MSSD in diameters of 0.1 m, MSPD in px of an image 640 wide)."""
     ids = ["scene_id", "im_id", "obj_id"]
-    truth_table = pd.DataFrame(truths, columns=[*ids, "visib_fract", "inst_count"])
+    truth_table = pd.DataFrame(instances, columns=[*ids, "visib_fract", "inst_count"])
     truth_table["gt_index"] = truth_table.groupby(["scene_id", "im_id"]).cumcount()
     truth_table["diameter_m"], truth_table["image_width_px"] = 0.1, 640
     estimate_table = pd.DataFrame(estimates, columns=[*ids, "score"])
     estimate_table["line"] = np.arange(len(estimate_table)) + 2
-    error_table = pd.DataFrame(errors, columns=["estimate", "truth", "mssd_m", "mspd_px"])
+    error_table = pd.DataFrame(errors, columns=["estimate", "instance", "mssd_m", "mspd_px"])
     error_table["mssd_m"] *= 0.1
-    return AllErrors(estimates=estimate_table, truths=truth_table, errors=error_table)
+    return AllErrors(estimates=estimate_table, instances=truth_table, errors=error_table)
 
 
 # Plain means and shares
@@ -173,7 +174,7 @@ def test_matching_starts_anew_for_every_threshold():
         [(1, 0, 1, 0.9), (1, 0, 1, 0.5)],
         [(0, 0, 0.30, 99), (0, 1, 0.32, 99), (1, 0, 0.10, 99), (1, 1, 0.9, 99)],
     )
-    shares = bop19_shares(data)
+    shares = bop19_recalls(data)
     # Of equal decimals 0.30 is under: the limit is six times 0.05 in floating point, 0.30000000000000004.
     assert shares.bop19_mssd.tolist() == [0.8, 0.0]
     assert shares.bop19_mspd.tolist() == [0.0, 0.0]
@@ -186,7 +187,7 @@ def test_errors_are_matched_apart():
         [(1, 0, 1, 0.9), (1, 0, 1, 0.5)],
         [(0, 0, 0.6, 1), (0, 1, 0.01, 60), (1, 0, 0.01, 60), (1, 1, 0.6, 1)],
     )
-    shares = bop19_shares(data)
+    shares = bop19_recalls(data)
     assert shares.bop19_mssd.tolist() == [1.0, 1.0]
     assert shares.bop19_mspd.tolist() == [1.0, 1.0]
 
@@ -199,14 +200,16 @@ def test_only_the_most_visible_instances_and_best_scored_estimates_count():
         [(1, 0, 1, 0.5), (1, 0, 1, 0.9)],
         [(0, 0, 0.9, 90), (0, 1, 0.01, 1), (1, 0, 0.01, 1), (1, 1, 0.9, 90)],
     )
-    shares = bop19_shares(data)
+    shares = bop19_recalls(data)
     assert shares.gt_index.tolist() == [1]
     assert shares.bop19_mssd.tolist() == [0.0]
 
 
 def test_equally_visible_instances_count_in_the_images_order():
-    truths = everything([(1, 0, 1, 0.5, 2), (1, 0, 1, 0.7, 2), (1, 0, 1, 0.5, 2), (1, 0, 2, NAN, 1)], [], []).truths
-    assert target_truths(truths).tolist() == [True, True, False, True]
+    instances = everything(
+        [(1, 0, 1, 0.5, 2), (1, 0, 1, 0.7, 2), (1, 0, 1, 0.5, 2), (1, 0, 2, NAN, 1)], [], []
+    ).instances
+    assert target_instances(instances).tolist() == [True, True, False, True]
 
 
 def test_equal_scores_keep_the_files_order():
@@ -216,7 +219,7 @@ def test_equal_scores_keep_the_files_order():
 
 def test_missing_instances_lower_the_recall():
     data = everything([(1, 0, 1, 1.0, 1), (1, 1, 1, 1.0, 1)], [(1, 0, 1, 1.0)], [(0, 0, 0.0, 0.0)])
-    assert bop19_shares(data).bop19_mssd.mean() == 0.5
+    assert bop19_recalls(data).bop19_mssd.mean() == 0.5
 
 
 def test_bop19_shares_replace_the_rows_own_recall():
@@ -259,30 +262,30 @@ def test_average_precision_by_hand():
 
 
 def test_precision_falls_with_false_alarms_that_score_higher():
-    truths = [(1, 0, 1, 1.0, 1)]
+    instances = [(1, 0, 1, 1.0, 1)]
     wrong = [(0, 0, 0.9, 99), (1, 0, 0.0, 0)]
-    behind = bop24_precision(everything(truths, [(1, 0, 1, 0.2), (1, 0, 1, 0.8)], wrong))
-    before = bop24_precision(everything(truths, [(1, 0, 1, 0.8), (1, 0, 1, 0.2)], wrong))
+    behind = bop24_precision(everything(instances, [(1, 0, 1, 0.2), (1, 0, 1, 0.8)], wrong))
+    before = bop24_precision(everything(instances, [(1, 0, 1, 0.8), (1, 0, 1, 0.2)], wrong))
     assert behind["ap"] == pytest.approx(1.0)
     assert before["ap"] == pytest.approx(0.5)
 
 
 def test_hardly_visible_instances_ask_for_nothing_and_forgive_their_estimates():
-    truths = [(1, 0, 1, 0.09, 0), (1, 0, 1, 0.1, 1)]
+    instances = [(1, 0, 1, 0.09, 0), (1, 0, 1, 0.1, 1)]
     estimates = [(1, 0, 1, 0.9), (1, 0, 1, 0.8)]
     errors = [(0, 0, 0.0, 0), (0, 1, 0.9, 99), (1, 0, 0.9, 99), (1, 1, 0.0, 0)]
-    result = bop24_precision(everything(truths, estimates, errors))
+    result = bop24_precision(everything(instances, estimates, errors))
     assert result["ap"] == 1.0
     assert (result["instances"], result["estimates"]) == (1, 2)
     # With a limit of 0 both instances count, and both are found.
-    assert bop24_precision(everything(truths, estimates, errors), visible=0.0)["instances"] == 2
+    assert bop24_precision(everything(instances, estimates, errors), visible=0.0)["instances"] == 2
     # Without its instance the first estimate is a false alarm before the true one.
-    assert bop24_precision(everything(truths[1:], estimates, [(0, 0, 0.9, 99), (1, 0, 0.0, 0)]))["ap"] == 0.5
+    assert bop24_precision(everything(instances[1:], estimates, [(0, 0, 0.9, 99), (1, 0, 0.0, 0)]))["ap"] == 0.5
 
 
 def test_objects_without_an_instance_have_no_part():
-    truths = [(1, 0, 1, 1.0, 1), (1, 0, 2, 0.05, 0)]
-    result = bop24_precision(everything(truths, [(1, 0, 1, 1.0)], [(0, 0, 0.0, 0.0)]))
+    instances = [(1, 0, 1, 1.0, 1), (1, 0, 2, 0.05, 0)]
+    result = bop24_precision(everything(instances, [(1, 0, 1, 1.0)], [(0, 0, 0.0, 0.0)]))
     assert list(result["by_object"]) == [1]
     assert result["ap"] == 1.0
 
@@ -294,9 +297,9 @@ def test_an_object_that_is_never_estimated_has_no_precision():
 
 
 def test_estimates_of_absent_objects_are_left_out_and_counted_where_asked():
-    truths = [(1, 0, 1, 1.0, 1), (1, 1, 2, 1.0, 1)]
+    instances = [(1, 0, 1, 1.0, 1), (1, 1, 2, 1.0, 1)]
     estimates = [(1, 0, 1, 0.5), (1, 0, 2, 0.9), (1, 1, 2, 0.5)]
-    data = everything(truths, estimates, [(0, 0, 0.0, 0.0), (2, 1, 0.0, 0.0)])
+    data = everything(instances, estimates, [(0, 0, 0.0, 0.0), (2, 1, 0.0, 0.0)])
     result = bop24_precision(data)
     assert (result["ap"], result["absent"], result["estimates"]) == (1.0, 1, 2)
     strict = bop24_precision(data, count_absent=True)
@@ -304,9 +307,9 @@ def test_estimates_of_absent_objects_are_left_out_and_counted_where_asked():
 
 
 def test_only_the_best_scored_estimates_of_an_image_count():
-    truths = [(1, 0, 1, 1.0, 1), (1, 0, 2, 1.0, 1)]
+    instances = [(1, 0, 1, 1.0, 1), (1, 0, 2, 1.0, 1)]
     estimates = [(1, 0, 1, 0.1), (1, 0, 2, 0.9), (1, 0, 2, 0.8)]
-    data = everything(truths, estimates, [(0, 0, 0.0, 0.0), (1, 1, 0.0, 0.0), (2, 1, 0.9, 90.0)])
+    data = everything(instances, estimates, [(0, 0, 0.0, 0.0), (1, 1, 0.0, 0.0), (2, 1, 0.9, 90.0)])
     assert bop24_precision(data)["ap"] == 1.0
     cut = bop24_precision(data, per_image=2)
     assert (cut["ap"], cut["outscored"]) == (0.5, 1)
@@ -329,16 +332,18 @@ def test_nothing_asked_for_has_no_precision():
 def world(seed):
     """Ties in scores, hardly visible instances, more and fewer asked for than there are, a file in mixed order."""
     rng = np.random.default_rng(seed)
-    truths, estimates = [], []
+    instances, estimates = [], []
     for scene, image in ((2, 0), (2, 3), (5, 0), (5, 4), (5, 7)):
         for obj in (1, 2, 5):
             count, asked = int(rng.integers(0, 4)), int(rng.integers(1, 4))
-            truths += [(scene, image, obj, float(rng.choice([0.02, 0.1, 0.5, 0.5, 0.9])), asked) for _ in range(count)]
+            instances += [
+                (scene, image, obj, float(rng.choice([0.02, 0.1, 0.5, 0.5, 0.9])), asked) for _ in range(count)
+            ]
             estimates += [(scene, image, obj, float(rng.choice([0.2, 0.5, 0.9]))) for _ in range(rng.integers(0, 6))]
     estimates = [estimates[index] for index in rng.permutation(len(estimates))]
-    pairs = [(e, g) for e, one in enumerate(estimates) for g, two in enumerate(truths) if one[:3] == two[:3]]
+    pairs = [(e, g) for e, one in enumerate(estimates) for g, two in enumerate(instances) if one[:3] == two[:3]]
     errors = [(e, g, float(rng.gamma(1.0, 0.2)), float(rng.gamma(1.0, 20.0))) for e, g in pairs]
-    data = everything(truths, estimates, errors)
+    data = everything(instances, estimates, errors)
     base = rng.uniform(size=len(pairs))
     for index, name in enumerate(VSD_COLUMNS):
         data.errors[name] = np.maximum(base - 0.05 * index, 0.0)
@@ -349,8 +354,8 @@ def plain_matches(errors, scores_of, limit):
     """BOP's rule for one image and object: {estimate: {truth: error}} to {estimate: truth}, as one would say it."""
     taken = {}
     for estimate in sorted(errors, key=lambda one: -scores_of[one]):
-        free = {truth: error for truth, error in errors[estimate].items() if truth not in taken.values()}
-        under_limit = {truth: error for truth, error in free.items() if error < limit}
+        free = {gt: error for gt, error in errors[estimate].items() if gt not in taken.values()}
+        under_limit = {gt: error for gt, error in free.items() if error < limit}
         if under_limit:
             taken[estimate] = min(under_limit, key=under_limit.__getitem__)
     return taken
@@ -360,16 +365,15 @@ def plain_matches(errors, scores_of, limit):
 def test_fast_matching_is_the_plain_one(seed):
     data = world(seed)
     error = np.round(data.errors.mssd_m.to_numpy() / 0.1, 1)  # many ties
-    estimate, truth = data.errors.estimate.to_numpy(), data.errors.truth.to_numpy()
+    estimate, gt = data.errors.estimate.to_numpy(), data.errors.instance.to_numpy()
     limits = np.array([0.1, 0.25, 0.5])
     rank = ranks(data.estimates, ["scene_id", "im_id", "obj_id"])
-    fast = greedy_matches(estimate, truth, error, rank, len(data.truths), limits)
+    fast = greedy_matches(estimate, gt, error, rank, len(data.instances), limits)
     for level, limit in enumerate(limits):
         expected = np.full(len(data.estimates), -1)
         for _, rows in data.estimates.groupby(["scene_id", "im_id", "obj_id"]):
             listed = {
-                int(e): {int(g): x for i, g, x in zip(estimate, truth, error, strict=True) if i == e}
-                for e in rows.index
+                int(e): {int(g): x for i, g, x in zip(estimate, gt, error, strict=True) if i == e} for e in rows.index
             }
             for e, g in plain_matches(listed, data.estimates.score, limit).items():
                 expected[e] = g
@@ -401,7 +405,7 @@ BOP_TOOLKIT = {
 @pytest.mark.parametrize("seed", BOP_TOOLKIT)
 def test_bop_scores_are_those_that_bop_toolkit_printed(seed):
     data = world(seed)
-    shares, precision = bop19_shares(data), bop24_precision(data)
+    shares, precision = bop19_recalls(data), bop24_precision(data)
     for name, expected in BOP_TOOLKIT[seed].items():
         value = precision[name] if name.startswith("ap") else shares[name].mean()
         assert value == pytest.approx(expected, abs=1e-14), name

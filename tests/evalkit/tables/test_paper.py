@@ -24,13 +24,13 @@ def perturb(dataset_path, out, *options):
     assert CliRunner().invoke(main, list(map(str, arguments)), catch_exceptions=False).exit_code == 0
 
 
-def moved(starts, dataset, share):
+def moved(initial_poses, dataset, share):
     """Starts with their translation error multiplied by `share` and no rotation error."""
     better = []
-    for start in starts:
-        truth = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id)
-        dt_m = share * (start.T_cam_obj[:3, 3] - truth.T_cam_obj[:3, 3])
-        better.append(replace(start, T_cam_obj=se3.apply_update(truth.T_cam_obj, np.eye(3), dt_m)))
+    for start in initial_poses:
+        gt = next(gt for gt in dataset.gt(start.scene_id, start.im_id) if gt.obj_id == start.obj_id)
+        dt_m = share * (start.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3])
+        better.append(replace(start, T_cam_obj=se3.apply_update(gt.T_cam_obj, np.eye(3), dt_m)))
     return better
 
 
@@ -38,10 +38,10 @@ def moved(starts, dataset, share):
 def work(tmp_path, monkeypatch, dataset_path):
     monkeypatch.chdir(tmp_path)
     perturb(dataset_path, "results/start.csv", "--random-up-to", 20, "--random-translation", 0.3)
-    starts, dataset = read_results("results/start.csv"), BopDataset(dataset_path)
+    initial_poses, dataset = read_results("results/start.csv"), BopDataset(dataset_path)
     for loss, share in (("contour", 0.25), ("mse", 0.5)):
         sidecar = {"dataset": str(dataset_path), "method": "refinenet", "loss": loss}
-        write_results(f"results/{loss}.csv", moved(starts, dataset, share), sidecar)
+        write_results(f"results/{loss}.csv", moved(initial_poses, dataset, share), sidecar)
     return tmp_path
 
 
@@ -77,14 +77,14 @@ def test_before_after_and_losses_from_a_working_folder(work):
 
 def test_curves_from_perturbed_starts_and_what_departs_from_the_protocol(work, dataset_path):
     perturb(dataset_path, "curve/start.csv", "--protocol", "paper")
-    starts, dataset = read_results("curve/start.csv"), BopDataset(dataset_path)
+    initial_poses, dataset = read_results("curve/start.csv"), BopDataset(dataset_path)
     sidecar = {
         "dataset": str(dataset_path),
         "method": "refinenet",
         "settings": {"iterations": 5},
         "perturbation": read_sidecar("curve/start.csv")["perturbation"],
     }
-    write_results("curve/refined.csv", moved(starts, dataset, 0.5), sidecar)
+    write_results("curve/refined.csv", moved(initial_poses, dataset, 0.5), sidecar)
     result = run("--results", "curve/start.csv", "--results", "curve/refined.csv", "--out", "curve.json")
     assert result.exit_code == 0, result.output
     found = by_name(work / "curve.json")

@@ -6,14 +6,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from error_tables import errors_table
-from evalkit.inputs.result_files import ResultFile
+from evalkit.inputs.result_files import ResultFile, method_names
 from evalkit.tables.model import Interval, best_cells
 from evalkit.tables.paper_refinement import (
     Method,
     ablation_table,
     before_after_table,
     error_table,
-    method_names,
     score_by_group_table,
 )
 
@@ -68,7 +67,7 @@ def test_totals_of_table_2b_are_means_over_sequences_and_not_over_frames():
     for place, name in enumerate(TEJANI_VSS):
         # The printed sequences are rounded to three digits, so their mean is within half a digit of the printed total.
         assert total.cells[f"vss_mean_{place}"] == pytest.approx(TEJANI_TOTAL[name], abs=0.00101)
-    by_pose = ablation_table(methods, of="poses").rows[-1]
+    by_pose = ablation_table(methods, mean_over="poses").rows[-1]
     weighted = np.average(TEJANI_VSS["ours"], weights=TEJANI_FRAMES)
     assert by_pose.cells["vss_mean_0"] == pytest.approx(weighted)
     assert abs(weighted - TEJANI_TOTAL["ours"]) > 0.006
@@ -99,14 +98,14 @@ def test_errors_are_means_along_each_axis_and_recall_is_at_a_tenth_of_the_diamet
     assert cells["ty_mm_mean"] == pytest.approx(2.0)
     assert cells["tz_mm_mean"] == pytest.approx(40.0)
     assert cells["add_recall_0.1d"] == pytest.approx((1 / 3 + 1) / 2)
-    cells = error_table([Method(name="a", table=start)], of="poses").rows[0].cells
+    cells = error_table([Method(name="a", table=start)], mean_over="poses").rows[0].cells
     assert cells["re_deg_mean"] == pytest.approx(25.0)
     assert cells["add_recall_0.1d"] == pytest.approx(0.5)
 
 
 def test_a_missing_pose_fails_and_has_no_part_in_mean_errors():
     refined = two_objects(found=[True, True, False, True], re_rad=np.deg2rad([2.0, 4.0, 0.0, 6.0]), add_m=0.001)
-    cells = error_table([Method(name="a", table=refined)], of="poses").rows[0].cells
+    cells = error_table([Method(name="a", table=refined)], mean_over="poses").rows[0].cells
     assert (cells["expected"], cells["missing"]) == (4, 1)
     assert cells["re_deg_mean"] == pytest.approx(4.0)
     assert cells["add_recall_0.1d"] == pytest.approx(0.75)
@@ -153,7 +152,7 @@ def test_intervals_of_totals_resample_whole_scenes():
 
 def test_names_come_from_sidecars():
     files = [
-        file("init", method="start"),
+        file("init", method="initial"),
         file("a", method="refinenet", loss="contour"),
         file("b", method="refinenet", settings={"loss": "mse"}),
         file("c"),

@@ -5,27 +5,16 @@ import io
 import json
 
 import pytest
-from evalkit.tables.model import (
-    Column,
-    Interval,
-    Row,
-    Table,
-    best_cells,
-    cell_text,
-    csv_text,
-    json_data,
-    latex,
-    latex_text,
-    markdown,
-    text_of,
-    write_tables,
-)
+from evalkit.tables.latex import latex, latex_text
+from evalkit.tables.markdown import markdown
+from evalkit.tables.model import Interval, Row, Table, TableColumn, best_cells, cell_text
+from evalkit.tables.writers import csv_text, json_data, text_of, write_tables
 from posecore.errors import ConfigError
 
-VSS = Column(key="vss", heading="VSS", digits=3, better="higher")
-ROTATION = Column(key="re_deg", heading="rotation", unit="deg", digits=1, better="lower")
-ADD = Column(key="add", heading="ADD", group="recall", unit="%", digits=1, better="higher")
-METHOD = Column(key="method", heading="method")
+VSS = TableColumn(key="vss", heading="VSS", digits=3, better="higher")
+ROTATION = TableColumn(key="re_deg", heading="rotation", unit="deg", digits=1, better="lower")
+ADD = TableColumn(key="add", heading="ADD", group="recall", unit="%", digits=1, better="higher")
+METHOD = TableColumn(key="method", heading="method")
 
 
 def table_of(*rows, columns=(METHOD, VSS, ROTATION, ADD), **rest):
@@ -52,7 +41,7 @@ def row(method, vss=None, re_deg=None, add=None, **rest):
         (ROTATION, float("nan"), "–"),
         (ROTATION, None, "–"),
         (METHOD, "a b", "a b"),
-        (Column(key="n", heading="poses", digits=0), 349, "349"),
+        (TableColumn(key="n", heading="poses", digits=0), 349, "349"),
     ],
 )
 def test_cells_are_rounded_and_shares_are_shown_in_percent(column, cell, text):
@@ -92,7 +81,7 @@ def test_a_total_is_not_better_than_the_rows_it_sums_up():
 
 
 def test_along_a_row_methods_are_columns():
-    ours, theirs = (Column(key=key, heading=key, digits=2, better="lower") for key in ("ours", "theirs"))
+    ours, theirs = (TableColumn(key=key, heading=key, digits=2, better="lower") for key in ("ours", "theirs"))
     table = Table(
         title="RMS",
         columns=[METHOD, ours, theirs],

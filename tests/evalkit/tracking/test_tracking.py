@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from evalkit.tables.model import Interval, best_cells
 from evalkit.tracking import (
-    Track,
+    ObjectTrack,
     TrackedFile,
     axis_table,
     changes,
     euler_deg,
-    legacy_angles_deg,
     residuals,
     run_with_resets,
     sequence_table,
@@ -47,9 +46,9 @@ def off(T_gt, R=None, t_m=(0.0, 0.0, 0.0)):
     return se3.apply_update(T_gt, np.broadcast_to(R, (len(T_gt), 3, 3)), np.broadcast_to(np.array(t_m), (len(T_gt), 3)))
 
 
-def track(T_est, T_gt, info=None, given=None, frame=None, time_s=None, name="scene 1, object 5"):
+def track(T_est, T_gt, info=None, was_initialised=None, frame=None, time_s=None, name="scene 1, object 5"):
     n = len(T_gt)
-    return Track(
+    return ObjectTrack(
         scene_id=1,
         obj_id=5,
         instance=0,
@@ -59,7 +58,7 @@ def track(T_est, T_gt, info=None, given=None, frame=None, time_s=None, name="sce
         T_est=np.array(T_est, np.float64),
         T_gt=T_gt,
         time_s=np.full(n, -1.0) if time_s is None else np.array(time_s, np.float64),
-        given=None if given is None else np.array(given, bool),
+        was_initialised=None if was_initialised is None else np.array(was_initialised, bool),
         info=info,
     )
 
@@ -118,29 +117,19 @@ def test_euler_angles_are_those_of_rz_ry_rx():
 def test_359_degrees_against_1_and_181_against_179_are_errors_of_2(true, estimated):
     T_gt = np.stack([se3.make_T(about(Z, true), np.array([0, 0, 0.5]))] * 3)
     T_est = np.stack([se3.make_T(about(Z, estimated), np.array([0, 0, 0.5]))] * 3)
-    for choi_legacy in (False, True):
-        scores = track_scores(track(T_est, T_gt), choi_legacy=choi_legacy)
-        assert scores["yaw_rms_deg"] == pytest.approx(2.0)
-        assert scores["roll_rms_deg"] == pytest.approx(0.0, abs=1e-6)
+    scores = track_scores(track(T_est, T_gt))
+    assert scores["yaw_rms_deg"] == pytest.approx(2.0)
+    assert scores["roll_rms_deg"] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_legacy_angles_are_unwrapped_where_a_sequence_passes_180_degrees():
-    # Truth turns from 170 to 190 degrees; the estimate is 4 degrees ahead and passes 180 earlier.
-    yaw = np.arange(170.0, 191.0, 2.0)
-    R_gt = np.stack([about(Z, angle) for angle in yaw])
-    R_est = np.stack([about(Z, angle + 4.0) for angle in yaw])
-    np.testing.assert_allclose(legacy_angles_deg(R_est, R_gt)[:, 2], 4.0, atol=1e-9)
-    wrapped = euler_deg(R_est)[:, 2] - euler_deg(R_gt)[:, 2]
-    assert np.abs(wrapped).max() > 300.0  # what a plain difference would hold
-
-
-def test_legacy_angles_exaggerate_where_the_pitch_is_near_90_degrees():
-    # One degree about x, at a pitch of 89: roll and yaw run apart, the residual's angles do not.
+def test_angles_stay_small_where_the_pitch_is_near_90_degrees():
+    # One degree about x, at a pitch of 89: roll and yaw of the poses run apart, the residual's angles do not.
     T_gt = np.stack([se3.make_T(about(Y, 89.0), np.array([0, 0, 0.5]))] * 2)
     T_est = off(T_gt, about(X, 1.0))
-    old, new = (track_scores(track(T_est, T_gt), choi_legacy=legacy) for legacy in (True, False))
-    assert new["roll_rms_deg"] == pytest.approx(1.0)
-    assert old["yaw_rms_deg"] > 20.0
+    scores = track_scores(track(T_est, T_gt))
+    assert scores["roll_rms_deg"] == pytest.approx(1.0)
+    assert scores["yaw_rms_deg"] == pytest.approx(0.0, abs=1e-6)
+    assert np.abs(euler_deg(T_est[0, :3, :3]) - euler_deg(T_gt[0, :3, :3])).max() > 20.0  # as a plain difference
 
 
 def test_residuals_are_in_camera_axes():
@@ -168,7 +157,7 @@ def test_lost_frames_fail_and_have_no_part_in_the_rms():
 
 def test_a_sequence_that_is_lost_altogether_has_no_errors():
     T_gt = moving(3)
-    scores = track_scores(track(np.full_like(T_gt, np.nan), T_gt), choi_legacy=True)
+    scores = track_scores(track(np.full_like(T_gt, np.nan), T_gt))
     assert (scores["lost"], scores["success_5cm5deg"]) == (3.0, 0.0)
     assert np.isnan([scores["x_rms_mm"], scores["yaw_rms_deg"], scores["time_ms_mean"]]).all()
 
@@ -291,7 +280,7 @@ def test_given_frames_are_not_scored_and_count_as_failures_but_for_the_first():
     T_est = off(T_gt, None, (0.001, 0, 0))
     T_est[3] = T_gt[3]  # a file may hold the pose that was given ...
     T_est[0, 0, 3] += 1.0  # ... or anything else
-    scores = track_scores(track(T_est, T_gt, given=[True, False, False, True, False, False]))
+    scores = track_scores(track(T_est, T_gt, was_initialised=[True, False, False, True, False, False]))
     assert (scores["frames"], scores["failed"], scores["resets"]) == (5.0, 1.0, 1.0)
     assert scores["success_5cm5deg"] == pytest.approx(0.8)
     assert scores["x_rms_mm"] == pytest.approx(1.0)
@@ -301,7 +290,7 @@ def test_given_frames_are_not_scored_and_count_as_failures_but_for_the_first():
 def test_a_run_without_resets_has_none_rather_than_zero():
     T_gt = moving(3)
     assert np.isnan(track_scores(track(T_gt, T_gt))["resets"])
-    assert track_scores(track(T_gt, T_gt, given=[True, False, False]))["resets"] == 0.0
+    assert track_scores(track(T_gt, T_gt, was_initialised=[True, False, False]))["resets"] == 0.0
 
 
 def test_time_is_the_mean_of_the_known_ones():
@@ -313,24 +302,24 @@ def test_time_is_the_mean_of_the_known_ones():
 class FakeTracker:
     """Follows the truth perfectly but fails in chosen frames, and remembers where it was set to the truth."""
 
-    def __init__(self, truths, fails):
-        self.truths, self.fails, self.set_at = truths, fails, []
+    def __init__(self, T_gt, fails):
+        self.T_gt, self.fails, self.set_at = T_gt, fails, []
 
     def initialise(self, frame, T_cam_obj):
-        np.testing.assert_array_equal(T_cam_obj, self.truths[frame])
+        np.testing.assert_array_equal(T_cam_obj, self.T_gt[frame])
         self.set_at.append(frame)
 
     def track(self, frame):
-        return self.fails.get(frame, self.truths[frame])
+        return self.fails.get(frame, self.T_gt[frame])
 
 
 def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
-    truths = moving(10)
-    fails = {3: se3.apply_update(truths[3], about(X, 6.0), np.zeros(3)), 7: None}
-    tracker = FakeTracker(truths, fails)
-    run = run_with_resets(tracker, iter(range(10)), truths)
+    T_gt = moving(10)
+    fails = {3: se3.apply_update(T_gt[3], about(X, 6.0), np.zeros(3)), 7: None}
+    tracker = FakeTracker(T_gt, fails)
+    run = run_with_resets(tracker, iter(range(10)), T_gt)
     assert tracker.set_at == [0, 3, 7]
-    assert np.flatnonzero(run.given).tolist() == [0, 3, 7]
+    assert np.flatnonzero(run.was_initialised).tolist() == [0, 3, 7]
     assert run.success == pytest.approx(7 / 9)
     np.testing.assert_array_equal(run.T_est[3], fails[3])
     assert np.isnan(run.T_est[[0, 7]]).all()
@@ -338,9 +327,9 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
 
 
 def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
-    truths = moving(10)
-    run = run_with_resets(FakeTracker(truths, {4: None, 5: None}), range(10), truths)
-    scores = track_scores(track(run.T_est, truths, given=run.given))
+    T_gt = moving(10)
+    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt)
+    scores = track_scores(track(run.T_est, T_gt, was_initialised=run.was_initialised))
     assert scores["success_5cm5deg"] == pytest.approx(run.success) == pytest.approx(7 / 9)
     assert (scores["resets"], scores["failed"]) == (2.0, 2.0)
     assert run.resets(2, 5, range(100, 110)) == [
@@ -349,21 +338,21 @@ def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
 
 
 def test_a_symmetric_copy_is_no_failure():
-    truths = moving(4)
-    copies = {frame: truths[frame] @ half_turn(Z) for frame in range(4)}
-    assert run_with_resets(FakeTracker(truths, copies), range(4), truths, info=symmetric(half_turn(Z))).success == 1.0
-    assert run_with_resets(FakeTracker(truths, copies), range(4), truths).success == 0.0
+    T_gt = moving(4)
+    copies = {frame: T_gt[frame] @ half_turn(Z) for frame in range(4)}
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, info=symmetric(half_turn(Z))).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt).success == 0.0
 
 
 def test_sequences_that_cannot_be_tracked_are_refused():
-    truths = moving(3)
+    T_gt = moving(3)
     with pytest.raises(ConfigError, match="without frames"):
-        run_with_resets(FakeTracker(truths, {}), [], [])
-    truths[1] = np.nan
-    with pytest.raises(ConfigError, match="frame 1 has no true pose"):
-        run_with_resets(FakeTracker(truths, {}), range(3), truths)
+        run_with_resets(FakeTracker(T_gt, {}), [], [])
+    T_gt[1] = np.nan
+    with pytest.raises(ConfigError, match="frame 1 has no ground-truth pose"):
+        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt)
     with pytest.raises(ValueError, match="zip"):
-        run_with_resets(FakeTracker(truths, {}), range(1), truths)
+        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt)
 
 
 def two_sequences(t_m, **rest):
@@ -406,7 +395,7 @@ def test_means_of_sequences_have_intervals_where_asked_for():
 
 def test_failures_without_a_reset_are_said():
     T_gt = moving(5)
-    broken = track(lost(T_gt, 2), T_gt, given=[True, False, False, False, False])
+    broken = track(lost(T_gt, 2), T_gt, was_initialised=[True, False, False, False, False])
     note = sequence_table([TrackedFile(name="a", tracks=[broken])]).note
     assert "a: 1 failed frames without a reset, so RBOT's protocol was not kept" in note
     assert "not RBOT's number" not in note

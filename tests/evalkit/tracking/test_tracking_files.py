@@ -180,11 +180,6 @@ def test_several_files_stand_side_by_side_and_are_written_as_asked(sequence, tmp
     assert r"\textbf{0.00}" in (tmp_path / "t.tex").read_text()
 
 
-def test_choi_legacy_is_said(sequence, tmp_path):
-    write_results(tmp_path / "r.csv", tugs())
-    assert "Choi legacy" in run("--dataset", sequence, "--results", tmp_path / "r.csv", "--choi-legacy").output
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
@@ -200,13 +195,20 @@ def test_mistakes_are_one_line(sequence, tmp_path, arguments, code, message):
     assert message in result.stderr
 
 
+def test_the_removed_option_is_refused(sequence, tmp_path):
+    write_results(tmp_path / "r.csv", tugs())
+    result = run("--dataset", sequence, "--results", tmp_path / "r.csv", "--choi-legacy")
+    assert result.exit_code == 2
+    assert "--choi-legacy is now removed: angles are those of the residual rotation" in result.stderr
+
+
 def test_perturbed_starts_are_no_sequence(sequence, tmp_path):
     write_results(tmp_path / "r.csv", tugs())
     dataset = BopDataset(sequence)
     (file,) = load_result_files([tmp_path / "r.csv"], dataset)
     table, T_est, T_gt = frames_of(dataset, file)
     table.loc[1, ["im_id", "obj_id", "gt_index"]] = table.loc[0, ["im_id", "obj_id", "gt_index"]]
-    with pytest.raises(ResultFileError, match="has several poses of one instance"):
+    with pytest.raises(ResultFileError, match="has several poses of the object"):
         tracks_of(dataset, file, table, T_est, T_gt)
 
 

@@ -1,4 +1,4 @@
-"""`evalkit check`: everything that is wrong in a BOP dataset and in result files, not only the first thing."""
+"""`evalkit check`: all faults of a BOP dataset and of result files, not only the first one."""
 
 from evalkit.check.findings import Findings, Level, Violation
 from evalkit.check.run import check

@@ -1,4 +1,4 @@
-"""Annotations of every image: cameras, true poses, visibility, each entry on its own so that none hides another."""
+"""Annotations of every image: cameras, ground-truth poses, visibility; a faulty entry does not hide the others."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -22,25 +22,25 @@ Array = np.ndarray
 Image = tuple[int, int]
 KINDS: tuple[Kind, ...] = ("camera", "gt", "gt_info")
 ROUGH_ROTATION = 1e-3
-"""Largest entry of R R^T - I that passes without a word; up to `ROTATION_TOLERANCE` it is a warning."""
+"""Largest entry of R R^T - I without a finding; up to `ROTATION_TOLERANCE` it is a warning."""
 FOCAL_RANGE = (0.2, 20.0)
 """Focal length in image sides: a view of 136 degrees, and one of 3."""
 
 
 @dataclass(kw_only=True)
 class Scenes:
-    """What is usable of a split's annotations.
+    """Usable annotations of a split.
 
     Attributes:
         images: images with a camera, in order.
-        truths: usable annotations of each image with ground truth.
-        instances: how many poses each object has in each image with ground truth.
-        matrices: camera matrix of each image where it is one.
+        instances: usable annotations of each image with ground truth.
+        instance_counts: number of poses of each object in each image with ground truth.
+        matrices: valid camera matrices by image.
     """
 
     images: list[Image] = field(default_factory=list)
-    truths: dict[Image, list[GroundTruth]] = field(default_factory=dict)
-    instances: dict[Image, Counter[int]] = field(default_factory=dict)
+    instances: dict[Image, list[GroundTruth]] = field(default_factory=dict)
+    instance_counts: dict[Image, Counter[int]] = field(default_factory=dict)
     matrices: dict[Image, Float[Array, "3 3"]] = field(default_factory=dict)
 
 
@@ -59,13 +59,13 @@ def check_scenes(dataset: BopDataset, infos: Mapping[int, ModelInfo], findings: 
             _check_camera(entry, where, (scene_id, im_id), scenes, findings)
         for im_id, (entry, where) in entries["gt"].items():
             image = (scene_id, im_id)
-            truths = _check_truths(entry, where, entries["gt_info"].get(im_id), infos, findings)
-            scenes.truths[image] = truths
-            scenes.instances[image] = Counter(truth.obj_id for truth in truths if truth.has_pose)
+            instances = _check_instances(entry, where, entries["gt_info"].get(im_id), infos, findings)
+            scenes.instances[image] = instances
+            scenes.instance_counts[image] = Counter(gt.obj_id for gt in instances if gt.has_pose)
         findings.cover("scenes")
         findings.cover("images", len(entries["camera"]))
         dataset.forget(scene_id)
-    findings.cover("true poses", sum(len(truths) for truths in scenes.truths.values()))
+    findings.cover("ground-truth poses", sum(len(instances) for instances in scenes.instances.values()))
     _check_units(dataset, scenes, findings)
     return scenes
 
@@ -79,19 +79,19 @@ def _entries(dataset: BopDataset, scene_id: int, kind: Kind, findings: Findings)
     entries = {}
     for im_id in im_ids:
         try:
-            found = dataset.entry(scene_id, im_id, kind)
+            annotation = dataset.entry(scene_id, im_id, kind)
         except DatasetError as error:
             findings.add_error("json", error)
             continue
-        if found is not None:
-            entries[im_id] = found
+        if annotation is not None:
+            entries[im_id] = annotation
     return entries
 
 
 def _check_keys(
     dataset: BopDataset, scene_id: int, entries: Mapping[Kind, Mapping[int, Any]], findings: Findings
 ) -> None:
-    """The three files speak of the same images."""
+    """Check that the three files list the same images."""
     rules: tuple[tuple[Kind, Kind, Level], ...] = (
         ("gt", "camera", "error"),
         ("gt", "gt_info", "error"),
@@ -139,7 +139,7 @@ def _check_camera(entry: Any, where: str, image: Image, scenes: Scenes, findings
 
 
 def check_camera_size(K: Float[Array, "3 3"], size: tuple[int, int], where: str, findings: Findings) -> None:
-    """Whether a camera matrix fits an image of this width and height."""
+    """Check a camera matrix against its image's width and height."""
     width, height = size
     focal = float(K[0, 0]) / max(width, height)
     if not FOCAL_RANGE[0] < focal < FOCAL_RANGE[1]:
@@ -155,11 +155,11 @@ def focal_words() -> str:
     return f"{FOCAL_RANGE[0]:g} to {FOCAL_RANGE[1]:g} times the longer side"
 
 
-def _check_truths(
+def _check_instances(
     entries: Any, where: str, info: tuple[Any, str] | None, infos: Mapping[int, ModelInfo], findings: Findings
 ) -> list[GroundTruth]:
     if not isinstance(entries, list):
-        findings.add("error", "truth", where, f"found a {type(entries).__name__}, expected a list of objects")
+        findings.add("error", "ground-truth", where, f"found a {type(entries).__name__}, expected a list of objects")
         return []
     about: list[Any] = []
     if info is not None:
@@ -170,36 +170,38 @@ def _check_truths(
             about = info[0]
             for index, item in enumerate(about):
                 _check_info(item, f"{info[1]}, entry {index}", findings)
-    truths = []
+    instances = []
     for index, entry in enumerate(entries):
-        place = f"{where}, entry {index}"
-        share = _share(about[index]) if about else None
+        entry_where = f"{where}, entry {index}"
+        visible_fraction = _visible_fraction(about[index]) if about else None
         try:
-            truth = ground_truth(entry, index, share, place)
+            gt = ground_truth(entry, index, visible_fraction, entry_where)
         except DatasetError as error:
-            findings.add_error("truth", error)
+            findings.add_error("ground-truth", error)
             continue
-        truths.append(truth)
-        if infos and truth.obj_id not in infos:
-            known = ", ".join(map(str, sorted(infos)))
-            findings.add("error", "unknown-object", place, f"'obj_id' is {truth.obj_id}, models_info.json has {known}")
-        if truth.has_pose:
-            _check_pose(truth, place, findings)
-    _check_repeated(truths, where, findings)
-    return truths
+        instances.append(gt)
+        if infos and gt.obj_id not in infos:
+            listed = ", ".join(map(str, sorted(infos)))
+            findings.add(
+                "error", "unknown-object", entry_where, f"'obj_id' is {gt.obj_id}, models_info.json has {listed}"
+            )
+        if gt.has_pose:
+            _check_pose(gt, entry_where, findings)
+    _check_repeated(instances, where, findings)
+    return instances
 
 
-def _share(entry: Any) -> float | None:
+def _visible_fraction(entry: Any) -> float | None:
     try:
         return visib_fract(entry, "")
     except DatasetError:
         return None
 
 
-def _check_pose(truth: GroundTruth, where: str, findings: Findings) -> None:
-    R, z_mm = truth.T_cam_obj[:3, :3], truth.T_cam_obj[2, 3] / MM
+def _check_pose(gt: GroundTruth, where: str, findings: Findings) -> None:
+    R, z_mm = gt.T_cam_obj[:3, :3], gt.T_cam_obj[2, 3] / MM
     if z_mm <= 0:
-        findings.add("error", "behind-camera", where, f"t_z is {z_mm:g} mm, expected a pose before the camera")
+        findings.add("error", "behind-camera", where, f"t_z is {z_mm:g} mm, expected a pose in front of the camera")
     residual = float(np.abs(R @ R.T - np.eye(3)).max())
     if residual > ROUGH_ROTATION:
         scale = float(np.linalg.det(R)) ** (1 / 3)
@@ -207,23 +209,23 @@ def _check_pose(truth: GroundTruth, where: str, findings: Findings) -> None:
         findings.add("warning", "rough-rotation", where, message, "it is used as it stands, as bop_toolkit does")
 
 
-def _check_repeated(truths: list[GroundTruth], where: str, findings: Findings) -> None:
+def _check_repeated(instances: list[GroundTruth], where: str, findings: Findings) -> None:
     seen: dict[tuple[int, bytes], int] = {}
-    for truth in truths:
-        if truth.has_pose:
-            first = seen.setdefault((truth.obj_id, truth.T_cam_obj.tobytes()), truth.gt_index)
-            if first != truth.gt_index:
-                message = f"entries {first} and {truth.gt_index} are the same pose of object {truth.obj_id}"
-                findings.add("warning", "repeated-truth", where, message)
+    for gt in instances:
+        if gt.has_pose:
+            first = seen.setdefault((gt.obj_id, gt.T_cam_obj.tobytes()), gt.gt_index)
+            if first != gt.gt_index:
+                message = f"entries {first} and {gt.gt_index} are the same pose of object {gt.obj_id}"
+                findings.add("warning", "repeated-ground-truth", where, message)
 
 
 def _check_info(entry: Any, where: str, findings: Findings) -> None:
     try:
-        share = visib_fract(entry, where)
+        visible_fraction = visib_fract(entry, where)
     except DatasetError as error:
         findings.add_error("visibility", error)
         return
-    if share is None:
+    if visible_fraction is None:
         findings.add("warning", "visibility", where, "has no 'visib_fract'")
     counts = [entry.get(f"px_count_{name}") for name in ("all", "visib")]
     for box in ("bbox_obj", "bbox_visib"):
@@ -240,13 +242,13 @@ def _check_info(entry: Any, where: str, findings: Findings) -> None:
     if not 0 <= visible <= every:
         message = f"'px_count_visib' is {visible} and 'px_count_all' {every}, expected 0 <= visible <= all"
         findings.add("error", "visibility", where, message)
-    elif share is not None and every and abs(share - visible / every) > 1e-3:
-        message = f"'visib_fract' is {share:g}, expected {visible}/{every} = {visible / every:.4g}"
+    elif visible_fraction is not None and every and abs(visible_fraction - visible / every) > 1e-3:
+        message = f"'visib_fract' is {visible_fraction:g}, expected {visible}/{every} = {visible / every:.4g}"
         findings.add("error", "visibility", where, message)
 
 
 def _check_units(dataset: BopDataset, scenes: Scenes, findings: Findings) -> None:
-    z_mm = [truth.T_cam_obj[2, 3] / MM for truths in scenes.truths.values() for truth in truths if truth.has_pose]
+    z_mm = [gt.T_cam_obj[2, 3] / MM for instances in scenes.instances.values() for gt in instances if gt.has_pose]
     if z_mm and float(np.median(np.abs(z_mm))) < SUSPICIOUS_DISTANCE_MM:
-        message = f"the median t_z of {len(z_mm)} true poses is {float(np.median(z_mm)):.4g} mm"
+        message = f"the median t_z of {len(z_mm)} ground-truth poses is {float(np.median(z_mm)):.4g} mm"
         findings.add("error", "units", str(dataset.split_path), message, "metres? BOP files hold millimetres")

@@ -1,4 +1,4 @@
-"""What a check found: violations by kind, each with its place, bounded in number and counted in full."""
+"""Findings of a check: violations by kind, the first of each kind kept and all counted."""
 
 import json
 from collections import Counter
@@ -13,14 +13,14 @@ LEVELS: tuple[Level, ...] = ("error", "warning", "hint")
 
 @dataclass(frozen=True, kw_only=True)
 class Violation:
-    """One thing that is wrong.
+    """One violation of a rule.
 
     Attributes:
-        level: error: numbers will be wrong or cannot be had; warning: probably not meant; hint: a custom is broken.
+        level: error: scores are wrong or impossible; warning: probably unintended; hint: a convention is broken.
         kind: short name of the rule, the same for all its violations.
         where: file, line, image or key.
-        message: what was found and what is right.
-        hint: what may be behind it or what to do; empty where the message says all.
+        message: the value in the file and the expected one.
+        hint: probable cause or remedy; empty where the message suffices.
     """
 
     level: Level
@@ -30,12 +30,12 @@ class Violation:
     hint: str = ""
 
     def __str__(self) -> str:
-        said = f"{self.where}: {self.message}" if self.where else self.message
-        return f"{said} ({self.hint})" if self.hint else said
+        sentence = f"{self.where}: {self.message}" if self.where else self.message
+        return f"{sentence} ({self.hint})" if self.hint else sentence
 
 
 class Findings:
-    """Collects violations; of each kind the first ones are kept and all are counted."""
+    """Violations: the first ones of each kind, and the counts of all."""
 
     def __init__(self, limit: int | None = 10) -> None:
         """Start empty.
@@ -49,30 +49,30 @@ class Findings:
         self.covered: Counter[str] = Counter()
 
     def add(self, level: Level, kind: str, where: str, message: str, hint: str = "") -> None:
-        """Note a violation."""
+        """Add a violation."""
         self.counts[level, kind] += 1
         if self.limit is None or self.counts[level, kind] <= self.limit:
             self.violations.append(Violation(level=level, kind=kind, where=where, message=message, hint=hint))
 
     def add_error(self, kind: str, error: PoseError) -> None:
-        """Note what a reader refused; its message names the place."""
+        """Add the error of a reader, whose message names the file."""
         self.add("error", kind, "", str(error))
 
     def cover(self, what: str, count: int = 1) -> None:
-        """Count what was looked at, so that a report of nothing found says how much that means."""
+        """Count checked items: without violations, they are the report's content."""
         self.covered[what] += count
 
     def total(self, level: Level) -> int:
-        """How many violations of a level there are."""
+        """Number of violations of a level."""
         return sum(count for (of_level, _), count in self.counts.items() if of_level == level)
 
     @property
     def ok(self) -> bool:
-        """Whether there is no error."""
+        """Whether there are no errors."""
         return self.total("error") == 0
 
     def lines(self) -> list[str]:
-        """One line for each violation that is kept, errors first, and one for what is left out of each kind."""
+        """One line for each violation kept, errors first, and one for the rest of each kind."""
         lines = []
         for level in LEVELS:
             for kind in dict.fromkeys(v.kind for v in self.violations if v.level == level):
@@ -83,13 +83,13 @@ class Findings:
         return lines
 
     def summary(self) -> str:
-        """Counts in words: what was looked at and how much was found."""
-        seen = ", ".join(f"{what} {count}" for what, count in self.covered.items())
-        found = ", ".join(_plural(self.total(level), level) for level in LEVELS if self.total(level))
-        return f"{found or 'nothing wrong'}; looked at: {seen or 'nothing'}"
+        """Counts in words: violations and checked items."""
+        covered = ", ".join(f"{what} {count}" for what, count in self.covered.items())
+        violations = ", ".join(_plural(self.total(level), level) for level in LEVELS if self.total(level))
+        return f"{violations or 'nothing wrong'}; checked: {covered or 'nothing'}"
 
     def as_json(self) -> str:
-        """Everything, for programs."""
+        """All findings as JSON."""
         content = {
             "ok": self.ok,
             "counts": {level: self.total(level) for level in LEVELS},

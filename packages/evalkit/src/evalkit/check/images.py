@@ -1,4 +1,4 @@
-"""Images, depth and masks: there, decodable, of one size, and in agreement with the annotations."""
+"""Images, depth and masks: present, decodable, of equal size, and consistent with the annotations."""
 
 from collections.abc import Mapping
 
@@ -19,13 +19,13 @@ Size = tuple[int, int]
 MASK_KINDS: tuple[MaskKind, ...] = ("mask", "mask_visib")
 CLEARLY_VISIBLE = 0.3
 DEPTH_RATIO = (0.5, 2.0)
-"""Depth at the objects over their t_z, median over an image: outside of this the scale is wrong."""
+"""Median over an image of depth / t_z at the objects: outside this range the depth scale is wrong."""
 
 
-def check_pixels(
+def check_images(
     dataset: BopDataset, scenes: Scenes, infos: Mapping[int, ModelInfo], samples: int, findings: Findings
 ) -> list[Image]:
-    """Check that every image is there, and decode some of them, spread evenly; returns which."""
+    """Check that every image is present and decode a sample, spread evenly; returns the sample."""
     there = [image for image in scenes.images if _is_there(dataset, image, findings)]
     chosen = spread(there, samples)
     without_depth, without_masks = [], []
@@ -38,20 +38,20 @@ def check_pixels(
         where = f"{dataset.annotation(image[0], 'camera')}, image {image[1]}"
         if image in scenes.matrices:
             check_camera_size(scenes.matrices[image], size, where, findings)
-        truths = [truth for truth in scenes.truths.get(image, []) if truth.has_pose]
-        _check_on_image(dataset, image, size, truths, scenes, infos, findings)
-        if not _check_depth(dataset, image, size, truths, scenes, findings):
+        instances = [gt for gt in scenes.instances.get(image, []) if gt.has_pose]
+        _check_on_image(dataset, image, size, instances, scenes, infos, findings)
+        if not _check_depth(dataset, image, size, instances, scenes, findings):
             without_depth.append(image)
-        if scenes.truths.get(image) and not _check_masks(dataset, image, size, scenes.truths[image], findings):
+        if scenes.instances.get(image) and not _check_masks(dataset, image, size, scenes.instances[image], findings):
             without_masks.append(image)
     findings.cover("images decoded", len(chosen))
     _report_some_without(dataset, "depth", without_depth, len(chosen), findings)
-    _report_some_without(dataset, "mask", without_masks, sum(bool(scenes.truths.get(i)) for i in chosen), findings)
+    _report_some_without(dataset, "mask", without_masks, sum(bool(scenes.instances.get(i)) for i in chosen), findings)
     return chosen
 
 
 def spread(images: list[Image], samples: int) -> list[Image]:
-    """At most this many of the images, the first and the last among them, evenly between."""
+    """At most `samples` images, evenly spaced from the first to the last."""
     if len(images) <= samples:
         return images
     return [images[index] for index in np.linspace(0, len(images) - 1, samples).round().astype(int).tolist()]
@@ -72,7 +72,7 @@ def _check_colour(dataset: BopDataset, image: Image, findings: Findings) -> Size
     size = (rgb.shape[1], rgb.shape[0])
     stated = image_size(file)
     if stated != size:
-        findings.add("error", "image", str(file), f"is {_words(size)} pixels, its header says {_words(stated)}")
+        findings.add("error", "image", str(file), f"is {_words(size)} pixels, its header states {_words(stated)}")
     if rgb.max() == rgb.min():
         findings.add("warning", "image-blank", str(file), f"every pixel is {rgb[0, 0].tolist()}, expected a picture")
     return size
@@ -86,36 +86,36 @@ def _check_on_image(
     dataset: BopDataset,
     image: Image,
     size: Size,
-    truths: list[GroundTruth],
+    instances: list[GroundTruth],
     scenes: Scenes,
     infos: Mapping[int, ModelInfo],
     findings: Findings,
 ) -> None:
     if image not in scenes.matrices:
         return
-    seen = [truth for truth in truths if truth.visib_fract is None or truth.visib_fract > CLEARLY_VISIBLE]
-    seen = [truth for truth in seen if truth.obj_id in infos]
-    if not seen:
+    visible = [gt for gt in instances if gt.visib_fract is None or gt.visib_fract > CLEARLY_VISIBLE]
+    visible = [gt for gt in visible if gt.obj_id in infos]
+    if not visible:
         return
-    T_cam_obj = np.stack([truth.T_cam_obj for truth in seen])
-    reach_m = np.array([infos[truth.obj_id].diameter_m for truth in seen])
-    for truth, off_px in zip(seen, off_image_px(T_cam_obj, scenes.matrices[image], size, reach_m), strict=True):
+    T_cam_obj = np.stack([gt.T_cam_obj for gt in visible])
+    reach_m = np.array([infos[gt.obj_id].diameter_m for gt in visible])
+    for gt, off_px in zip(visible, off_image_px(T_cam_obj, scenes.matrices[image], size, reach_m), strict=True):
         if off_px > 0:
-            where = f"{dataset.annotation(image[0], 'gt')}, image {image[1]}, entry {truth.gt_index}"
-            message = f"object {truth.obj_id} lies at least {off_px:.0f} px outside the image of {_words(size)}"
+            where = f"{dataset.annotation(image[0], 'gt')}, image {image[1]}, entry {gt.gt_index}"
+            message = f"object {gt.obj_id} lies at least {off_px:.0f} px outside the image of {_words(size)}"
             findings.add("error", "off-image", where, message, "K or the pose is of another image?")
 
 
 def off_image_px(
     T_cam_obj: Float[Array, "n 4 4"], K: Float[Array, "3 3"], size: Size, reach_m: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """By how many pixels objects miss the image, 0 where they may touch it.
+    """Distance of objects from the image in pixels, 0 where they may touch it.
 
     Args:
-        T_cam_obj: poses, metres; one that is not well before the camera counts as touching.
+        T_cam_obj: poses, metres; one close to the camera or behind it counts as touching.
         K: camera matrix.
         size: width and height of the image, pixels.
-        reach_m: no point of the object is further from its origin.
+        reach_m: largest distance of the object's points from its origin.
     """
     z_m = T_cam_obj[:, 2, 3]
     is_far = z_m > 2 * reach_m
@@ -126,7 +126,7 @@ def off_image_px(
 
 
 def _check_depth(
-    dataset: BopDataset, image: Image, size: Size, truths: list[GroundTruth], scenes: Scenes, findings: Findings
+    dataset: BopDataset, image: Image, size: Size, instances: list[GroundTruth], scenes: Scenes, findings: Findings
 ) -> bool:
     file = dataset.depth_file(*image)
     if file is None:
@@ -152,7 +152,7 @@ def _check_depth(
     if not (depth_m > 0).any():
         findings.add("warning", "depth", str(file), "is 0 everywhere")
     elif image in scenes.matrices:
-        _check_depth_scale(str(file), depth_m, scale, truths, scenes.matrices[image], findings)
+        _check_depth_scale(str(file), depth_m, scale, instances, scenes.matrices[image], findings)
     return True
 
 
@@ -160,16 +160,16 @@ def _check_depth_scale(
     where: str,
     depth_m: Float[Array, "h w"],
     scale: float,
-    truths: list[GroundTruth],
+    instances: list[GroundTruth],
     K: Float[Array, "3 3"],
     findings: Findings,
 ) -> None:
     ratios = []
-    for truth in truths:
-        z_m = float(truth.T_cam_obj[2, 3])
-        if z_m <= 0 or (truth.visib_fract is not None and truth.visib_fract < CLEARLY_VISIBLE):
+    for gt in instances:
+        z_m = float(gt.T_cam_obj[2, 3])
+        if z_m <= 0 or (gt.visib_fract is not None and gt.visib_fract < CLEARLY_VISIBLE):
             continue
-        column, row = (int(value) for value in np.floor(project(K, truth.T_cam_obj[None, :3, 3])[0]))
+        column, row = (int(value) for value in np.floor(project(K, gt.T_cam_obj[None, :3, 3])[0]))
         if 0 <= row < depth_m.shape[0] and 0 <= column < depth_m.shape[1] and depth_m[row, column] > 0:
             ratios.append(depth_m[row, column] / z_m)
     if ratios and not DEPTH_RATIO[0] < float(np.median(ratios)) < DEPTH_RATIO[1]:
@@ -178,54 +178,56 @@ def _check_depth_scale(
         findings.add("error", "depth-scale", where, message, f"is the scale {scale / median:.3g} mm?")
 
 
-def _check_masks(dataset: BopDataset, image: Image, size: Size, truths: list[GroundTruth], findings: Findings) -> bool:
+def _check_masks(
+    dataset: BopDataset, image: Image, size: Size, instances: list[GroundTruth], findings: Findings
+) -> bool:
     """Check an image's masks; False where it has none of any kind."""
     info = _pixel_counts(dataset, image)
-    found_any = False
+    has_any = False
     for kind in MASK_KINDS:
         missing = []
-        for truth in truths:
+        for gt in instances:
             try:
-                found = dataset.mask_and_location(*image, truth.gt_index, kind)
+                mask_and_where = dataset.mask_and_location(*image, gt.gt_index, kind)
             except DatasetError as error:
                 findings.add_error("mask", error)
-                found_any = True
+                has_any = True
                 continue
-            if found is None:
-                missing.append(truth.gt_index)
+            if mask_and_where is None:
+                missing.append(gt.gt_index)
                 continue
-            found_any = True
-            mask, where = found
+            has_any = True
+            mask, where = mask_and_where
             if (mask.shape[1], mask.shape[0]) != size:
                 message = f"is {mask.shape[1]} x {mask.shape[0]} pixels, the image {_words(size)}"
                 findings.add("error", "mask", where, message)
                 continue
-            said = info.get(truth.gt_index)
-            if kind == "mask_visib" and said is not None and said != int(mask.sum()):
-                message = f"has {int(mask.sum())} pixels, 'px_count_visib' of scene_gt_info.json is {said}"
+            stated_count = info.get(gt.gt_index)
+            if kind == "mask_visib" and stated_count is not None and stated_count != int(mask.sum()):
+                message = f"has {int(mask.sum())} pixels, 'px_count_visib' of scene_gt_info.json is {stated_count}"
                 findings.add("warning", "mask", where, message)
-        if missing and len(missing) < len(truths):
+        if missing and len(missing) < len(instances):
             where = f"{dataset.scene_path(image[0])}, image {image[1]}"
             listed = ", ".join(map(str, missing))
             findings.add("error", "mask-missing", where, f"found no {kind} of entries {listed}, the others have one")
-    return found_any
+    return has_any
 
 
 def _pixel_counts(dataset: BopDataset, image: Image) -> dict[int, int]:
     try:
-        found = dataset.entry(*image, "gt_info")
+        entry = dataset.entry(*image, "gt_info")
     except DatasetError:
         return {}
-    entries = found[0] if found is not None and isinstance(found[0], list) else []
+    entries = entry[0] if entry is not None and isinstance(entry[0], list) else []
     counts = {index: e.get("px_count_visib") for index, e in enumerate(entries) if isinstance(e, dict)}
     return {index: count for index, count in counts.items() if isinstance(count, int)}
 
 
 def _report_some_without(
-    dataset: BopDataset, what: str, without: list[Image], looked_at: int, findings: Findings
+    dataset: BopDataset, what: str, without: list[Image], checked: int, findings: Findings
 ) -> None:
-    """A dataset without any is fine; one where some images have none may have lost them."""
-    if len(without) == looked_at:
+    """Report images without depth or masks where other images have them."""
+    if len(without) == checked:
         return
     for scene_id, im_id in without:
         where = f"{dataset.scene_path(scene_id)}, image {im_id}"

@@ -1,4 +1,4 @@
-"""Models against `models_info.json`: they load, are as large as it says, and have the symmetries it lists."""
+"""Models against `models_info.json`: loading, diameters, boxes and symmetries."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,23 +19,25 @@ from evalkit.check.findings import Findings, Level
 
 Array = np.ndarray
 DIAMETER_TOLERANCE = 5e-3
-"""Share of the diameter by which `models_info.json` may differ from the mesh it stands beside."""
+"""Largest relative difference of `models_info.json`'s diameter from the mesh beside the file."""
 EVAL_DIAMETER_TOLERANCE = 2e-2
 """The same for simplified models against the full ones' numbers."""
 MEAN_DISTANCE = 0.02
-"""Mean distance, in diameters, between a surface and itself moved by a transform that is no symmetry any more.
+"""Smallest mean distance, in diameters, between a surface and its image under a transform that is no symmetry.
 
-Sampling alone gives 0.005; LM-O's two symmetries 0.008 and 0.010, a half turn about another axis from 0.025 on.
+Sampling alone gives 0.005; LM-O's two symmetries 0.008 and 0.010; 180 degrees about another axis 0.025 or more.
 """
 MAX_DISTANCE = 0.1
-"""BOP takes a symmetry where no point is further away than a tenth of the diameter (or 15 mm)."""
+"""BOP's limit for a symmetry: every point within a tenth of the diameter (or 15 mm)."""
 SURFACE_POINTS = 20_000
 MOVED_POINTS = 2_000
 TURNS = 9
+UNIT_FACTORS = ((1e-3, "metres instead of millimetres in models_info.json?"), (1e3, "the mesh in metres?"), (10, "cm?"))
+"""Ratios of the stated diameter to the mesh's with their probable cause."""
 
 
 def check_models(dataset: BopDataset, findings: Findings) -> dict[int, ModelInfo]:
-    """Check every models folder; returns what is usable of `models_info.json`."""
+    """Check every models folder; returns the usable entries of `models_info.json`."""
     infos: dict[int, ModelInfo] = {}
     chosen = dataset.models_info_file
     for folder in [folder for folder in dataset.models_folders() if folder != chosen.parent]:
@@ -94,19 +96,20 @@ def _check_folder(folder: Path, infos: dict[int, ModelInfo], findings: Findings,
 
 
 def _check_diameter(path: Path, mesh: Mesh, info: ModelInfo, tolerance: float, findings: Findings) -> None:
-    found_mm, said_mm = mesh.diameter_m / MM, info.diameter_m / MM
-    if abs(found_mm - said_mm) <= tolerance * found_mm:
+    measured_mm, stated_mm = mesh.diameter_m / MM, info.diameter_m / MM
+    if abs(measured_mm - stated_mm) <= tolerance * measured_mm:
         return
-    ratio = said_mm / found_mm
+    ratio = stated_mm / measured_mm
     hint = next(
-        (text for factor, text in _FACTORS if abs(ratio / factor - 1) < 0.02), "calculate models_info.json anew"
+        (text for factor, text in UNIT_FACTORS if abs(ratio / factor - 1) < 0.02), "calculate models_info.json anew"
     )
     findings.add(
-        "error", "diameter", str(path), f"is {found_mm:.6g} mm across, models_info.json says {said_mm:.6g} mm", hint
+        "error",
+        "diameter",
+        str(path),
+        f"is {measured_mm:.6g} mm across, models_info.json states {stated_mm:.6g} mm",
+        hint,
     )
-
-
-_FACTORS = ((1e-3, "metres instead of millimetres in models_info.json?"), (1e3, "the mesh in metres?"), (10, "cm?"))
 
 
 def _check_box(file: Path, obj_id: int, mesh: Mesh, findings: Findings) -> None:
@@ -118,16 +121,16 @@ def _check_box(file: Path, obj_id: int, mesh: Mesh, findings: Findings) -> None:
         findings.add("hint", "model-box", where, f"has no {', '.join(missing)}; bop_toolkit's scripts write them")
         return
     try:
-        said = np.array([numbers(entry, name, 1, where)[0] for name in names])
+        stated = np.array([numbers(entry, name, 1, where)[0] for name in names])
     except DatasetError as error:
         findings.add_error("models-info", error)
         return
     low, high = mesh.vertices_m.min(axis=0) / MM, mesh.vertices_m.max(axis=0) / MM
-    found = np.concatenate([low, high - low])
-    wrong = np.flatnonzero(np.abs(found - said) > DIAMETER_TOLERANCE * mesh.diameter_m / MM)
+    measured = np.concatenate([low, high - low])
+    wrong = np.flatnonzero(np.abs(measured - stated) > DIAMETER_TOLERANCE * mesh.diameter_m / MM)
     if len(wrong):
         first = int(wrong[0])
-        message = f"'{names[first]}' is {said[first]:.6g}, the model's is {found[first]:.6g} mm"
+        message = f"'{names[first]}' is {stated[first]:.6g}, the model's is {measured[first]:.6g} mm"
         findings.add("warning", "model-box", where, message, "calculate models_info.json anew")
 
 
@@ -140,12 +143,14 @@ def _check_symmetries(file: Path, obj_id: int, mesh: Mesh, info: ModelInfo, find
         moved = se3.apply(transforms, points).reshape(-1, 3)
         distances = np.asarray(surface.query(moved)[0]) / mesh.diameter_m
         where = f"{file}, object {obj_id}, {name}"
-        said = f"moves the surface by {distances.mean():.3g} diameters on average, {distances.max():.3g} at most"
+        distance = f"moves the surface by {distances.mean():.3g} diameters on average, {distances.max():.3g} at most"
         if distances.mean() > MEAN_DISTANCE:
-            findings.add("error", "symmetry", where, f"{said}; a symmetry maps it onto itself", "wrong axis or offset?")
+            findings.add(
+                "error", "symmetry", where, f"{distance}; a symmetry maps it onto itself", "wrong axis or offset?"
+            )
         elif distances.max() > MAX_DISTANCE:
             findings.add(
-                "warning", "symmetry", where, f"{said}; BOP allows {MAX_DISTANCE} at most", "a handle or a text?"
+                "warning", "symmetry", where, f"{distance}; BOP allows {MAX_DISTANCE} at most", "a handle or a text?"
             )
 
 
@@ -158,7 +163,7 @@ def _symmetries(info: ModelInfo) -> Iterator[tuple[str, Float[Array, "n 4 4"]]]:
 
 
 def surface_points(mesh: Mesh, count: int) -> Float[Array, "n 3"]:
-    """Points spread evenly over a surface, the same at every call, metres."""
+    """Points spread evenly over a surface, metres; the same at every call."""
     corners = mesh.vertices_m[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     total = areas.sum()

@@ -1,4 +1,4 @@
-"""Result files against a dataset: every line that breaks the format, ids, times, counts, poses that cannot be seen."""
+"""Result files against a dataset: format of every line, ids, times, counts, poses outside the view."""
 
 import re
 from collections import defaultdict
@@ -18,12 +18,12 @@ from evalkit.check.images import off_image_px
 
 Array = np.ndarray
 TIME_TOLERANCE_S = 1e-3
-"""bop_toolkit's: times of one image further apart are refused."""
+"""Largest difference between an image's times that bop_toolkit accepts."""
 _NAME = re.compile(r"[^_]+_(?P<dataset>[^_-]+)-(?P<split>[^_-]+)(-[^_-]+)?(_.+)?\.csv")
 
 
 def check_results(path: Path, dataset: BopDataset | None, findings: Findings) -> None:
-    """Check a result file; against a dataset where it could be opened."""
+    """Check a result file, and where `dataset` is given also against it."""
     faults = 0
 
     def note(fault: LineFault) -> None:
@@ -64,7 +64,11 @@ def _check_repeated(path: Path, table: ResultTable, findings: Findings) -> None:
     for index in np.flatnonzero(firsts != np.arange(len(table))).tolist():
         message = f"repeats the estimate of line {int(table.line[firsts[index]])}"
         findings.add(
-            "warning", "duplicate", f"{path}:{int(table.line[index])}", message, "it counts again if asked for"
+            "warning",
+            "duplicate",
+            f"{path}:{int(table.line[index])}",
+            message,
+            "it counts again if a target asks for it",
         )
 
 
@@ -79,7 +83,7 @@ def _check_times(path: Path, table: ResultTable, findings: Findings) -> None:
     for index in np.flatnonzero(differs).tolist():
         other = int(first[group[index]])
         message = (
-            f"time is {table.time_s[index]:g}, line {int(table.line[other])} of the same image says "
+            f"time is {table.time_s[index]:g}, line {int(table.line[other])} of the same image has "
             f"{table.time_s[other]:g}; it is the image's run time, or -1 in every line"
         )
         findings.add("error", "time", f"{path}:{int(table.line[index])}", message)
@@ -102,7 +106,7 @@ def _check_scores(path: Path, table: ResultTable, findings: Findings) -> None:
     keys = np.stack([table.scene_id, table.im_id, table.obj_id], axis=1)
     competing = len(np.unique(keys, axis=0)) < len(table)
     if competing and low == high:
-        message = f"every score is {low:g}, so nothing decides which of several estimates of an object counts"
+        message = f"every score is {low:g}, so nothing decides between several estimates of an object"
         findings.add("warning", "score", str(path), message)
 
 
@@ -123,13 +127,13 @@ def _check_against(path: Path, table: ResultTable, dataset: BopDataset, findings
         return
     for fault in unknown:
         findings.add("error", f"line-{fault.field}", f"{path}:{fault.line}", fault.message)
-    known = ~np.isin(table.line, [fault.line for fault in unknown])
+    is_valid = ~np.isin(table.line, [fault.line for fault in unknown])
     _check_counts(path, table, dataset, findings)
-    _check_poses(path, table, known, dataset, findings)
+    _check_poses(path, table, is_valid, dataset, findings)
 
 
 def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings: Findings) -> None:
-    """Against localisation targets: too few estimates count as missed, too many are ignored from the lowest score."""
+    """Against localisation targets: missing estimates are failures; surplus ones, lowest scores first, are ignored."""
     try:
         targets = dataset.targets
     except PoseError:  # reported with the dataset
@@ -138,14 +142,14 @@ def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings:
     ids = zip(table.scene_id.tolist(), table.im_id.tolist(), table.obj_id.tolist(), strict=True)
     for index, key in enumerate(ids):
         lines[key].append(index)
-    wanted = {(target.scene_id, target.im_id, target.obj_id): target.inst_count for target in targets}
-    for key, count in wanted.items():
-        found = len(lines.get(key, ()))
-        if found < count:
-            message = f"found {found} of {count} estimates of object {key[2]} in scene {key[0]}, image {key[1]}"
-            findings.add("warning", "missing", str(path), message, "what is missing counts as a failure")
+    counts = {(target.scene_id, target.im_id, target.obj_id): target.inst_count for target in targets}
+    for key, count in counts.items():
+        count_in_file = len(lines.get(key, ()))
+        if count_in_file < count:
+            message = f"found {count_in_file} of {count} estimates of object {key[2]} in scene {key[0]}, image {key[1]}"
+            findings.add("warning", "missing", str(path), message, "missing estimates count as failures")
     for key, indices in lines.items():
-        count = wanted.get(key, 0)
+        count = counts.get(key, 0)
         by_score = sorted(indices, key=lambda index: -table.score[index])
         for index in sorted(by_score[count:]):
             asked = f"the targets ask for {count} of object {key[2]} here" if count else "no target asks for it"
@@ -153,14 +157,14 @@ def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings:
 
 
 def _check_poses(
-    path: Path, table: ResultTable, known: Bool[Array, " n"], dataset: BopDataset, findings: Findings
+    path: Path, table: ResultTable, is_valid: Bool[Array, " n"], dataset: BopDataset, findings: Findings
 ) -> None:
-    """Poses that no camera sees."""
-    behind = known & (table.T_cam_obj[:, 2, 3] <= 0)
+    """Poses behind the camera or outside the image."""
+    behind = is_valid & (table.T_cam_obj[:, 2, 3] <= 0)
     for index in np.flatnonzero(behind).tolist():
         message = f"t_z is {table.T_cam_obj[index, 2, 3] / MM:.6g} mm, the object is behind the camera"
         findings.add("warning", "behind-camera", f"{path}:{int(table.line[index])}", message)
-    indices = np.flatnonzero(known & ~behind)
+    indices = np.flatnonzero(is_valid & ~behind)
     if not len(indices):
         return
     images = np.stack([table.scene_id[indices], table.im_id[indices]], axis=1)
@@ -188,5 +192,5 @@ def _check_name(path: Path, dataset: BopDataset | None, findings: Findings) -> N
         message = "its name is not METHOD_DATASET-SPLIT.csv, which the BOP server asks for"
         findings.add("hint", "file-name", str(path), message)
     elif dataset is not None and match["dataset"] != dataset.name:
-        message = f"its name says the dataset is {match['dataset']}, the folder is {dataset.name}"
+        message = f"its name has the dataset {match['dataset']}, the folder is {dataset.name}"
         findings.add("hint", "file-name", str(path), message)

@@ -1,4 +1,4 @@
-"""All checks in order: models, annotations, pixels, targets, ground truth against itself, result files."""
+"""All checks in order: models, annotations, images, targets, ground truth against itself, result files."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,10 +8,10 @@ from posecore.errors import PoseError
 
 from evalkit.check.annotations import check_scenes
 from evalkit.check.findings import Findings
-from evalkit.check.images import check_pixels
+from evalkit.check.images import check_images
 from evalkit.check.models import check_models
 from evalkit.check.results import check_results
-from evalkit.check.self_test import check_truth
+from evalkit.check.self_test import check_ground_truth
 from evalkit.check.targets import check_targets
 
 SAMPLES = 100
@@ -25,12 +25,12 @@ def check(
     sensor: str | None = None,
     samples: int = SAMPLES,
     limit: int | None = 10,
-    stage: Callable[[str], None] = lambda name: None,
+    on_stage: Callable[[str], None] = lambda name: None,
 ) -> Findings:
     """Check a dataset and result files.
 
-    Annotations, models and result lines are all read. Images are looked for, and `samples` of them, spread evenly,
-    decoded and their true poses evaluated against themselves.
+    All annotations, models and result lines are read. Every image has to be present; `samples` images, spread evenly,
+    are decoded, and their ground-truth poses evaluated against themselves.
 
     Args:
         dataset: BOP dataset folder.
@@ -39,10 +39,10 @@ def check(
         sensor: as `BopDataset` takes it.
         samples: images to decode.
         limit: violations of a kind to keep, None for all; every one is counted.
-        stage: is told what is checked next.
+        on_stage: called with the name of the next stage.
 
     Returns:
-        What was found; nothing a user's files can hold raises.
+        The findings; faults in the files do not raise.
     """
     findings = Findings(limit)
     opened: BopDataset | None = None
@@ -51,25 +51,25 @@ def check(
     except PoseError as error:
         findings.add_error("dataset", error)
     if opened is not None:
-        _check_dataset(opened, samples, findings, stage)
+        _check_dataset(opened, samples, findings, on_stage)
     for path in results:
-        stage(str(path))
+        on_stage(str(path))
         check_results(Path(path), opened if opened is not None and _has_models(opened) else None, findings)
     return findings
 
 
-def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, stage: Callable[[str], None]) -> None:
-    stage("models")
+def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, on_stage: Callable[[str], None]) -> None:
+    on_stage("models")
     infos = check_models(dataset, findings)
-    stage("annotations")
+    on_stage("annotations")
     scenes = check_scenes(dataset, infos, findings)
-    stage("images")
-    chosen = check_pixels(dataset, scenes, infos, samples, findings)
-    stage("targets")
+    on_stage("images")
+    chosen = check_images(dataset, scenes, infos, samples, findings)
+    on_stage("targets")
     check_targets(dataset, scenes, set(infos), findings)
-    if findings.ok:  # else the evaluation would refuse the same faults again
-        stage("ground truth against itself")
-        check_truth(dataset, scenes, chosen, findings)
+    if findings.ok:  # else the evaluation would report the same faults again
+        on_stage("ground truth against itself")
+        check_ground_truth(dataset, scenes, chosen, findings)
 
 
 def _has_models(dataset: BopDataset) -> bool:

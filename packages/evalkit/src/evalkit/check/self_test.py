@@ -10,19 +10,17 @@ from evalkit.check.findings import Findings
 ERRORS = ("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px", "re_rad", "re_sym_rad", "te_m")
 
 
-def check_truth(dataset: BopDataset, scenes: Scenes, images: list[Image], findings: Findings) -> None:
-    """Evaluate the true poses of some images as if a method had found them."""
+def check_ground_truth(dataset: BopDataset, scenes: Scenes, images: list[Image], findings: Findings) -> None:
+    """Evaluate the ground-truth poses of some images as if they were estimates."""
     from evalkit.evaluation.evaluator import Evaluator
-    from evalkit.inputs.pairing import Pair
+    from evalkit.inputs.pairing import MatchedPose
 
     pairs = []
     for image in images:
-        for truth in scenes.truths.get(image, []):
-            if truth.has_pose and truth.T_cam_obj[2, 3] > 0:
-                estimate = Estimate(
-                    scene_id=image[0], im_id=image[1], obj_id=truth.obj_id, T_cam_obj=truth.T_cam_obj.copy()
-                )
-                pairs.append(Pair(scene_id=image[0], im_id=image[1], truth=truth, estimate=estimate))
+        for gt in scenes.instances.get(image, []):
+            if gt.has_pose and gt.T_cam_obj[2, 3] > 0:
+                estimate = Estimate(scene_id=image[0], im_id=image[1], obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj.copy())
+                pairs.append(MatchedPose(scene_id=image[0], im_id=image[1], gt=gt, estimate=estimate))
     if not pairs:
         return
     try:
@@ -34,7 +32,7 @@ def check_truth(dataset: BopDataset, scenes: Scenes, images: list[Image], findin
     for row in table.itertuples(index=False):
         where = f"{dataset.annotation(row.scene_id, 'gt')}, image {row.im_id}, entry {row.gt_index}"
         wrong = [f"{name} is {getattr(row, name):.3g}" for name in ERRORS if getattr(row, name) != 0]
-        outside = row.visib_fract == 0 and row.vss == 0  # wholly outside the image there are no silhouettes to compare
+        outside = row.visib_fract == 0 and row.vss == 0  # wholly outside the image: no silhouettes to compare
         if row.vss != 1 and not outside:
             wrong.append(f"VSS is {row.vss:.6g}")
         if wrong:

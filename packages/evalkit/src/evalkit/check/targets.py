@@ -1,4 +1,4 @@
-"""Targets: every one exists, and asks for no more than ground truth has."""
+"""Targets: each one exists, and its count does not exceed the ground truth."""
 
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ EDITIONS = ("bop19", "bop24")
 
 
 def check_targets(dataset: BopDataset, scenes: Scenes, objects: set[int], findings: Findings) -> None:
-    """Check the targets files that the split has."""
+    """Check the split's targets files."""
     for edition in EDITIONS:
         file = dataset.targets_file(edition)
         if file is None:
@@ -31,7 +31,7 @@ def check_targets(dataset: BopDataset, scenes: Scenes, objects: set[int], findin
 def _check_entries(
     file: Path, entries: list[Any], dataset: BopDataset, scenes: Scenes, objects: set[int], findings: Findings
 ) -> None:
-    images, known, seen = set(scenes.images), set(dataset.scene_ids), dict[tuple[int, int, int], int]()
+    images, scene_ids, seen = set(scenes.images), set(dataset.scene_ids), dict[tuple[int, int, int], int]()
     for index, entry in enumerate(entries):
         where = f"{file}, entry {index}"
         try:
@@ -44,10 +44,10 @@ def _check_entries(
         image = (scene_id, im_id)
         first = seen.setdefault((*image, obj_id), index)
         if first != index:
-            findings.add("error", "target", where, f"repeats entry {first}; remove one of them")
-        elif scene_id not in known:
+            findings.add("error", "target", where, f"repeats entry {first}; remove either")
+        elif scene_id not in scene_ids:
             findings.add("error", "target", where, f"scene {scene_id} is not in {dataset.split_path}", "download it")
-        elif image not in images and image not in scenes.truths:
+        elif image not in images and image not in scenes.instances:
             findings.add("error", "target", where, f"scene {scene_id} has no image {im_id}")
         elif obj_id >= 0:
             _check_count(where, image, obj_id, count, scenes, objects, findings)
@@ -60,9 +60,9 @@ def _check_count(
         findings.add("error", "target", where, f"'obj_id' is {obj_id}, which models_info.json does not list")
     if count < 1:
         findings.add("error", "target", where, f"'inst_count' is {count}, expected 1 or more")
-    if image not in scenes.truths:  # ground truth that is not public
+    if image not in scenes.instances:  # ground truth that is not public
         return
-    there = scenes.instances[image][obj_id]
-    if count > there:
-        message = f"asks for {count} of object {obj_id}, scene_gt.json has {there} in image {image[1]}"
+    annotated = scenes.instance_counts[image][obj_id]
+    if count > annotated:
+        message = f"asks for {count} of object {obj_id}, scene_gt.json has {annotated} in image {image[1]}"
         findings.add("error", "target", where, message)

@@ -20,7 +20,7 @@ def main() -> None:
 
     \b
     Examples:
-      evalkit perturb --dataset lmo --out results/start.csv --random-up-to 20
+      evalkit perturb --dataset lmo --out results/initial.csv --random-up-to 20
       evalkit report
     """
 

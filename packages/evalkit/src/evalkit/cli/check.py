@@ -15,7 +15,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 @click.option("--sensor", help="Camera of several, such as cam1; rgb,gray1 where scenes differ.")
 @click.option("--samples", type=click.IntRange(0), default=100, help="Images to decode, spread evenly.")
 @click.option("--all", "show_all", is_flag=True, help="List every violation. Default: the first 10 of each kind.")
-@click.option("--json", "json_file", type=NEW_FILE, metavar="FILE", help="Write the findings for programs.")
+@click.option("--json", "json_file", type=NEW_FILE, metavar="FILE", help="Write the findings as JSON.")
 @verbose_option
 @click.pass_context
 def check(
@@ -28,11 +28,11 @@ def check(
     show_all: bool,
     json_file: Path | None,
 ) -> None:
-    """List everything that is wrong in a BOP dataset and in result files.
+    """List all faults of a BOP dataset and of result files.
 
     Reads every annotation, model and result line, decodes some images, and evaluates ground truth against itself.
-    Each violation says where it is, what was found and what is right. Exit code 0: no errors; 1: errors; 2: wrong
-    usage. Warnings and hints do not change it.
+    Each violation has its file and entry, the value found and the expected one. Exit code 0: no errors; 1: errors;
+    2: wrong usage. Warnings and hints do not change it.
 
     \b
     Examples:
@@ -45,7 +45,13 @@ def check(
     from evalkit.check.run import check as run_checks
 
     findings = run_checks(
-        dataset, results, split=split, sensor=sensor, samples=samples, limit=None if show_all else 10, stage=_say
+        dataset,
+        results,
+        split=split,
+        sensor=sensor,
+        samples=samples,
+        limit=None if show_all else 10,
+        on_stage=_show_stage,
     )
     for line in findings.lines():
         click.echo(line)
@@ -56,6 +62,6 @@ def check(
         ctx.exit(1)
 
 
-def _say(stage: str) -> None:
+def _show_stage(stage: str) -> None:
     if sys.stderr.isatty():
         click.echo(f"checking {stage} ...", err=True)

@@ -21,17 +21,17 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
     "--limit",
     type=click.FloatRange(0, min_open=True),
     default=0.1,
-    help="A pose fails with an ADD(-S) of so many diameters or more.",
+    help="Smallest ADD(-S) of a failed pose, diameters.",
 )
 @click.option(
-    "--fail-if", "rules", multiple=True, metavar="RULE", help="End with exit code 1 if this is so; may be repeated."
+    "--fail-if", "rules", multiple=True, metavar="RULE", help="Exit with code 1 if the rule holds. Repeatable."
 )
-@click.option("--result-a", metavar="NAME", help="Result file meant in A, where A is the estimates.csv of several.")
+@click.option("--result-a", metavar="NAME", help="Name of the result file in A, if A is the estimates.csv of several.")
 @click.option("--result-b", metavar="NAME", help="The same for B.")
-@click.option("--json", "json_file", type=NEW_FILE, help="Write everything as JSON.")
+@click.option("--json", "json_file", type=NEW_FILE, help="Write the comparison as JSON.")
 @click.option("--csv", "csv_file", type=NEW_FILE, help="Write a line for each pose.")
 @click.option("--html", "html_file", type=NEW_FILE, help="Write a page with pictures.")
-@click.option("--list", "listed", type=click.IntRange(0), default=10, help="Poses to list.")
+@click.option("--list", "listed", type=click.IntRange(0), default=10, help="Poses to list of each kind.")
 @click.option("--pictures", type=click.IntRange(0, 200), default=12, help="Pictures of each kind.")
 @click.option("--resamples", type=click.IntRange(1), default=1000, help="Of the bootstrap.")
 @click.option("--seed", type=click.IntRange(0), default=0, help="Of the bootstrap.")
@@ -55,50 +55,51 @@ def diff(
     resamples: int,
     seed: int,
 ) -> None:
-    """Compare result file B with A, pose by pose: deltas with 95 % intervals, what newly fails, what is newly solved.
+    """Compare result file B with A, pose by pose: deltas with 95 % intervals, newly failed and solved ones.
 
-    A and B are BOP result files, or tables of errors (estimates.csv) that `evalkit report` wrote, which need no
-    dataset.
+    A and B are BOP result files, or error tables (estimates.csv) of `evalkit report`, which need no dataset.
 
     \b
     Examples:
       evalkit diff old.csv new.csv --dataset lmo --html diff.html
       evalkit diff old.csv new.csv --fail-if "vss < -0.01" --fail-if "lower(recall) < -0.02"
-      evalkit diff report/estimates.csv report/estimates.csv --result-a start --result-b refined
+      evalkit diff report/estimates.csv report/estimates.csv --result-a initial --result-b refined
 
     \b
     Rules of --fail-if:
       NAME OPERATOR NUMBER                compares the mean delta, B minus A
       STATISTIC(NAME) OPERATOR NUMBER     mean, median, lower or upper (end of the 95 % interval of the mean)
-      shares, as fractions                vss, recall, auc, ar_mssd, ar_mspd
+      fractions                           vss, recall, auc, ar_mssd, ar_mspd
       errors, mm                          add, adi, add_s, mssd, te, tx, ty, tz
       errors, px and deg                  mspd, proj; re, re_sym
       numbers of poses                    newly_failed, newly_solved, lost, gained, unpaired
       operators                           < <= > >=
     """
-    from posecore.files import write_atomic
+    from evalkit.diff import DiffJob, compare_files, parse_rule
 
-    from evalkit.diff import differences, judge, open_sides, parse_rule
-    from evalkit.diff.text import csv_text, json_text, text
-
-    parsed = [parse_rule(rule) for rule in rules]
-    named = (result_a, result_b)
-    with open_sides((a, b), results=named, dataset=dataset, split=split, vss=vss, workers=workers) as sides:
-        difference = differences(sides, limit_diameters=limit, resamples=resamples, seed=seed)
-        verdicts = judge(parsed, difference)
-        click.echo(text(difference, listed))
-        if json_file:
-            write_atomic(json_file, json_text(difference, verdicts).encode())
-        if csv_file:
-            write_atomic(csv_file, csv_text(difference).encode())
-        if html_file:
-            from evalkit.diff.page import difference_page
-
-            write_atomic(html_file, difference_page(difference, verdicts, pictures).encode())
-    for file in (json_file, csv_file, html_file):
-        if file:
-            click.echo(f"Written: {file}")
-    for verdict in verdicts:
+    compared = compare_files(
+        DiffJob(
+            paths=(a, b),
+            results=(result_a, result_b),
+            dataset=dataset,
+            split=split,
+            vss=vss,
+            workers=workers,
+            limit_diameters=limit,
+            resamples=resamples,
+            seed=seed,
+            rules=tuple(map(parse_rule, rules)),
+            listed=listed,
+            pictures=pictures,
+            json_file=json_file,
+            csv_file=csv_file,
+            html_file=html_file,
+        )
+    )
+    click.echo(compared.text)
+    for file in compared.written:
+        click.echo(f"Written: {file}")
+    for verdict in compared.verdicts:
         click.echo(f"{'FAILED' if verdict.fired else 'passed'}: {verdict.words}", err=verdict.fired)
-    if any(verdict.fired for verdict in verdicts):
+    if any(verdict.fired for verdict in compared.verdicts):
         raise click.exceptions.Exit(1)

@@ -1,4 +1,4 @@
-"""What several commands have in common."""
+"""Option types and options shared by commands."""
 
 from pathlib import Path
 from typing import Any
@@ -36,5 +36,5 @@ workers_option = click.option(
     "--workers",
     type=click.IntRange(1),
     default=1,
-    help="Processes that score poses; the numbers do not depend on it.",
+    help="Processes that score poses; the results do not depend on it.",
 )

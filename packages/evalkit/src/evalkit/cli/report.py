@@ -31,37 +31,32 @@ def report(
     workers: int,
     worst: int,
 ) -> None:
-    """Write a report: one HTML page, its tables for papers, a CSV line for each pose, a JSON summary.
+    """Write a report: HTML page, tables for papers, CSV with a line for each pose, JSON summary.
 
-    Without options, it takes the result files (*.csv with *.csv.json beside it) in this folder and in results/, and
-    the dataset that their sidecars name. The folder then holds index.html (everything, in one file that opens
-    offline), tables.md and tables.tex, estimates.csv and summary.json.
+    Without options, the result files are those with a sidecar (*.csv.json) in this folder and in results/, and the
+    dataset is the one that the sidecars name. The report folder holds index.html (one file, readable offline),
+    tables.md, tables.tex, estimates.csv and summary.json.
 
     \b
     Examples:
       evalkit report
-      evalkit report --dataset lmo --results start.csv --results refined.csv --out report
+      evalkit report --dataset lmo --results initial.csv --results refined.csv --out report
     """
-    from posecore.bop import BopDataset
+    from evalkit.report.job import ReportJob, make_report
 
-    from evalkit.inputs.result_files import dataset_of, find_result_files
-    from evalkit.report.write import write_report
-
-    here = Path()
-    paths = list(results) or find_result_files(here, dataset is not None)
-    opened = BopDataset(dataset or dataset_of(paths, here), split)
+    job = ReportJob(out=out, results=results, dataset=dataset, split=split, vss=vss, worst=worst, workers=workers)
     with progress_bar(quiet=not sys.stderr.isatty()) as progress:
 
-        def start(name: str, total: int) -> Callable[[int], None]:
+        def on_file(name: str, total: int) -> Callable[[int], None]:
             task = progress.add_task(name, total=total)
             return lambda done: progress.advance(task, done)
 
-        written = write_report(opened, paths, out, vss=vss, worst=worst, workers=workers, start=start)
-    for item in written.summary["against_start"]:
+        made = make_report(job, on_file)
+    for item in made.summary["against_initial"]:
         click.echo(item["words"])
-    for file in written.summary["files"]:
+    for file in made.summary["files"]:
         click.echo(_total_line(file))
-    click.echo(f"Report: {written.page}")
+    click.echo(f"Report: {made.page}")
 
 
 def _total_line(file: dict[str, Any]) -> str:

@@ -18,7 +18,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option, 
     "--by",
     type=click.Choice(["object", "scene"]),
     default="object",
-    help="What has a row of its own and is counted once in totals.",
+    help="Group with a row of its own, counted once in totals.",
 )
 @vss_option
 @workers_option
@@ -35,29 +35,24 @@ def tables(
     resamples: int,
     out: tuple[Path, ...],
 ) -> None:
-    """Print the tables of the 2018 paper for these result files: start poses, refined ones, several methods.
+    """Print the tables of the 2018 paper: initial poses, refined poses, several methods.
 
     Rotation and translation errors and ADD recall, VSS of every object, each object before and after, losses side by
-    side; for starts perturbed by steps the curves. Totals are means over objects, as in the paper. Methods are named
-    by `method` and `loss` in the sidecars.
+    side; for initial poses perturbed by steps the curves. Totals are means over objects, as in the paper. Names of
+    methods are `method` and `loss` of the sidecars.
 
     \b
     Examples:
-      evalkit tables --results start.csv --results contour.csv --results mse.csv --by scene
+      evalkit tables --results initial.csv --results contour.csv --results mse.csv --by scene
       evalkit tables --out tables.tex --out tables.csv --resamples 1000
     """
-    from posecore.bop import BopDataset
+    from evalkit.tables.paper import PaperTablesJob, make_paper_tables
+    from evalkit.tables.writers import text_of
 
-    from evalkit.inputs.result_files import dataset_of, find_result_files
-    from evalkit.tables.model import require_suffixes, text_of, write_tables
-    from evalkit.tables.paper import paper_tables, score_files
-
-    require_suffixes(out)
-    here = Path()
-    paths = list(results) or find_result_files(here, dataset is not None)
-    opened = BopDataset(dataset or dataset_of(paths, here), split)
-    found = paper_tables(score_files(opened, paths, vss, workers=workers), by=by, resamples=resamples)
-    click.echo(text_of(found, ".md"), nl=False)
-    for path in out:
-        for written in write_tables(path, found):
-            click.echo(f"Table: {written}")
+    job = PaperTablesJob(
+        results=results, dataset=dataset, split=split, by=by, vss=vss, workers=workers, resamples=resamples, out=out
+    )
+    made, written = make_paper_tables(job)
+    click.echo(text_of(made, ".md"), nl=False)
+    for path in written:
+        click.echo(f"Table: {path}")

@@ -1,4 +1,4 @@
-"""Two tables of errors, pose by pose: deltas with intervals, what newly fails and what is newly solved."""
+"""Two error tables, pose by pose: deltas with intervals, newly failed and newly solved poses."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
-from posecore.bop import symmetry_transforms
 from posecore.errors import ConfigError
 
 from evalkit.diff.measures import MEASURES
@@ -19,23 +18,23 @@ from evalkit.scores.per_pose import solved
 
 Array = np.ndarray
 KEY = ["scene_id", "im_id", "obj_id", "gt_index"]
-LEVEL = ["start_angle_deg", "start_translation_diameter"]
+LEVEL = ["initial_angle_deg", "initial_translation_diameter"]
 LEVEL_DECIMALS = 6
-"""Levels of perturbation are equal where so many decimals are: a table of errors holds nine digits."""
+"""Decimals at which levels of perturbation are compared: an error table in CSV has nine digits."""
 NEWLY_FAILED, NEWLY_SOLVED = "newly failed", "newly solved"
 BOTH_FAILED, BOTH_SOLVED = "both failed", "both solved"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """How one measure differs between two files.
+    """Change of a measure between two files.
 
     Attributes:
-        poses: how many are compared: all paired ones for shares, those found in both files for errors.
+        poses: number compared: all paired ones for fractions, those found in both files for errors.
         mean_a: mean over these poses in the first file.
         mean_b: in the second.
-        mean_delta: mean of the second minus the first; NaN where no pose is compared.
-        mean_interval: its 95 % interval, None where there are fewer than two units.
+        mean_delta: mean of the second minus the first; NaN without poses.
+        mean_interval: its 95 % interval, None with fewer than two units.
         median_a: median over these poses in the first file.
         median_b: in the second.
         median_delta: median of the per-pose deltas, which is not the difference of the medians.
@@ -59,12 +58,12 @@ class Difference:
 
     Attributes:
         sides: both files.
-        pairs: one row for each expected pose of both: ids and start levels, `row_a` and `row_b` (in the sides' tables),
+        pairs: one row for each expected pose of both: ids, initial levels, `row_a` and `row_b` (in the sides' tables),
             `line_a`, `line_b`, `found_a`, `found_b`, for each measure `<name>_a`, `<name>_b` and `<name>_delta`
-            (second minus first), `status` ("newly failed" and so on), and `cause_a`, `cause_b` (why a pose failed)
-            where poses are known.
-        only_a: ids of poses that only the first file's table expects.
-        only_b: ids of poses that only the second's expects.
+            (second minus first), `status` ("newly failed" and so on), and `cause_a`, `cause_b` (of failures)
+            unless a side is an error table.
+        only_a: ids of poses expected of the first file only.
+        only_b: ids of poses expected of the second file only.
         changes: by measure.
         resampled: units of the intervals, in words.
         limit_diameters: an ADD(-S) of so many diameters or more is a failure.
@@ -79,7 +78,7 @@ class Difference:
     limit_diameters: float
 
     def with_status(self, status: str) -> pd.DataFrame:
-        """Pairs of a status, those lost or gained first, then by the size of their change of ADD(-S)."""
+        """Pairs of a status, those lost or gained first, then by falling change of ADD(-S)."""
         rows = self.pairs[self.pairs.status == status]
         size = rows.add_s_delta.abs().fillna(np.inf)
         return rows.loc[size.sort_values(ascending=False, kind="stable").index]
@@ -106,7 +105,7 @@ class Difference:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Numbers of poses, under the names that rules use."""
+        """Numbers of poses by their names in rules."""
         return {
             "newly_failed": len(self.newly_failed),
             "newly_solved": len(self.newly_solved),
@@ -134,7 +133,8 @@ def differences(
     rows_a, rows_b = paired_rows(a, b)
     if not len(rows_a):
         raise ConfigError(
-            f"{sides.a.path} and {sides.b.path}: no expected pose is in both; compare results of one dataset and split"
+            f"{sides.a.path} and {sides.b.path}: no expected pose is in both; "
+            "compare results of the same dataset and split"
         )
     pairs, changes, resampled = _compared(
         a.iloc[rows_a].reset_index(drop=True), b.iloc[rows_b].reset_index(drop=True), limit_diameters, resamples, seed
@@ -158,8 +158,8 @@ def differences(
 def paired_rows(a: pd.DataFrame, b: pd.DataFrame) -> tuple[Int[Array, " p"], Int[Array, " p"]]:
     """Positions of the same expected poses in two tables, in the first's order.
 
-    The same are those of one scene, image, object, true instance and start level; where there are several (random
-    starts), the first belongs to the first and so on.
+    Equal poses have the same scene, image, object, instance and initial level; of several (random initial poses), the
+    first is paired with the first and so on.
     """
     keyed = []
     for table in (a, b):
@@ -181,8 +181,8 @@ def _compared(
     columns |= {"line_a": a.line, "line_b": b.line, "found_a": a.found, "found_b": b.found}
     changes = {}
     for name, measure in MEASURES.items():
-        old, new = measure.of(a, limit_diameters), measure.of(b, limit_diameters)
-        with np.errstate(invalid="ignore"):  # an infinite error in both has no delta
+        old, new = measure.values_of(a, limit_diameters), measure.values_of(b, limit_diameters)
+        with np.errstate(invalid="ignore"):  # the delta of two infinite errors is 0
             delta = np.where(old == new, np.where(np.isnan(old), np.nan, 0.0), new - old)
         columns |= {f"{name}_a": old, f"{name}_b": new, f"{name}_delta": delta}
         changes[name] = _change(old, new, delta, drawn)
@@ -220,6 +220,5 @@ def _change(old: Float[Array, " p"], new: Float[Array, " p"], delta: Float[Array
 def _causes(side: Side, sides: Sides, limit_diameters: float) -> Array:
     assert side.scored is not None and sides.evaluator is not None
     infos = sides.evaluator.dataset.models_info
-    symmetries = {int(obj_id): symmetry_transforms(infos[int(obj_id)]) for obj_id in side.table.obj_id.unique()}
-    chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, symmetries, limit_diameters=limit_diameters)
+    chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, infos, limit_diameters=limit_diameters)
     return np.asarray(chosen.astype(str).to_numpy())

@@ -1,4 +1,4 @@
-"""What two result files are compared by: one value for each expected pose, with its unit and which way is better."""
+"""Measures for comparing two result files: one value for each expected pose, with unit and order."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,19 +19,19 @@ class Measure:
     """A measure.
 
     Attributes:
-        unit: of its values, empty for shares.
-        better: which way is better.
-        text: what it is.
-        of: a table and the limit of failure in diameters to one value a row. Shares and VSS are 0 where an estimate is
-            missing, errors are NaN: those are compared over the poses found in both files.
-        yes_or_no: whether each value is 0 or 1, whose median says nothing.
+        unit: of the values, empty for fractions.
+        better: order of the values.
+        text: description.
+        values_of: function of a table and the limit of failure in diameters, with one value a row. Fractions and VSS
+            are 0 where an estimate is missing; errors are NaN and compared over the poses found in both files.
+        is_binary: whether each value is 0 or 1, so that a median is meaningless.
     """
 
     unit: Literal["", "mm", "px", "deg"]
     better: Literal["higher", "lower"]
     text: str
-    of: Callable[[pd.DataFrame, float], Float[Array, " n"]]
-    yes_or_no: bool = False
+    values_of: Callable[[pd.DataFrame, float], Float[Array, " n"]]
+    is_binary: bool = False
 
     @property
     def digits(self) -> int:
@@ -39,30 +39,35 @@ class Measure:
         return 2 if self.unit else 4
 
 
-def _share(text: str, of: Callable[[pd.DataFrame, float], Array]) -> Measure:
-    return Measure(unit="", better="higher", text=text, of=of)
+def _fraction(text: str, values_of: Callable[[pd.DataFrame, float], Array]) -> Measure:
+    return Measure(unit="", better="higher", text=text, values_of=values_of)
 
 
 def _error(unit: Literal["mm", "px", "deg"], key: str, text: str) -> Measure:
-    return Measure(unit=unit, better="lower", text=text, of=lambda table, _: found_errors(table)[key])
+    return Measure(unit=unit, better="lower", text=text, values_of=lambda table, _: found_errors(table)[key])
 
 
 MEASURES: Mapping[str, Measure] = {
-    "vss": _share("visual surface similarity", lambda table, _: table.vss.to_numpy(np.float64)),
+    "vss": _fraction("visual surface similarity", lambda table, _: table.vss.to_numpy(np.float64)),
     "recall": Measure(
         unit="",
         better="higher",
         text="ADD(-S) under the limit",
-        of=lambda table, limit: solved(table, limit).astype(np.float64),
-        yes_or_no=True,
+        values_of=lambda table, limit: solved(table, limit).astype(np.float64),
+        is_binary=True,
     ),
-    "auc": _share("area of ADD(-S) recall to 100 mm", lambda table, _: area_under_recall(add_s_m(table), AUC_LIMIT_M)),
-    "ar_mssd": _share("BOP average recall of MSSD", lambda table, _: average_recalls(table)["ar_mssd"]),
-    "ar_mspd": _share("BOP average recall of MSPD", lambda table, _: average_recalls(table)["ar_mspd"]),
+    "auc": _fraction(
+        "area of ADD(-S) recall to 100 mm", lambda table, _: area_under_recall(add_s_m(table), AUC_LIMIT_M)
+    ),
+    "ar_mssd": _fraction("BOP average recall of MSSD", lambda table, _: average_recalls(table)["ar_mssd"]),
+    "ar_mspd": _fraction("BOP average recall of MSPD", lambda table, _: average_recalls(table)["ar_mspd"]),
     "add": _error("mm", "add_mm", "ADD"),
     "adi": _error("mm", "adi_mm", "ADI (ADD-S)"),
     "add_s": Measure(
-        unit="mm", better="lower", text="ADD(-S): ADI of symmetric objects", of=lambda table, _: add_s_m(table) * 1e3
+        unit="mm",
+        better="lower",
+        text="ADD(-S): ADI of symmetric objects",
+        values_of=lambda table, _: add_s_m(table) * 1e3,
     ),
     "mssd": _error("mm", "mssd_mm", "maximum surface distance"),
     "mspd": _error("px", "mspd_px", "maximum projected distance"),

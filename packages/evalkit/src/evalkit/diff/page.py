@@ -1,4 +1,4 @@
-"""A difference as one HTML page, with pictures of the poses that newly fail and are newly solved."""
+"""A difference as one HTML page, with pictures of newly failed and newly solved poses."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +14,7 @@ from evalkit.report import html
 from evalkit.report.html import Section
 from evalkit.report.page import cases
 from evalkit.scores import DEFINITIONS
-from evalkit.tables.model import Cell, Column, Interval, Row, Table
+from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 
 NAN = float("nan")
 
@@ -23,22 +23,22 @@ def difference_page(difference: Difference, verdicts: Sequence[Verdict], picture
     """The HTML document.
 
     Args:
-        difference: what is shown.
+        difference: of the two files.
         verdicts: of the rules.
-        pictures: largest number of cases among the newly failed, and as many among the newly solved.
+        pictures: largest number of pictures of newly failed poses, and of newly solved ones.
     """
     sides, counts = difference.sides, difference.counts
     title = f"{sides.b.name} against {sides.a.name}"
-    said = [
+    sentences = [
         f"{len(difference.pairs)} expected poses are in both files. {counts['newly_failed']} newly fail, "
         f"{counts['newly_solved']} are newly solved; {counts['lost']} are found in {sides.a.name} only, "
         f"{counts['gained']} in {sides.b.name} only.",
         *[verdict.words for verdict in verdicts],
     ]
     if counts["unpaired"]:
-        said.append(
-            f"Left out: {len(difference.only_a)} poses that only {sides.a.name} is asked for, "
-            f"{len(difference.only_b)} that only {sides.b.name} is."
+        sentences.append(
+            f"Left out: {len(difference.only_a)} poses expected of {sides.a.name} only, "
+            f"{len(difference.only_b)} of {sides.b.name} only."
         )
     sections = [
         Section(heading="Changes", parts=[html.table(table) for table in tables_of(difference)]),
@@ -49,21 +49,21 @@ def difference_page(difference: Difference, verdicts: Sequence[Verdict], picture
         Section(heading="Definitions", parts=[html.definitions(dict(DEFINITIONS))]),
         Section(heading="Inputs", parts=[html.definitions(dict((_input(sides.a), _input(sides.b))))]),
     ]
-    return html.page(title, "".join(html.paragraph(line) for line in said), sections)
+    return html.page(title, "".join(html.paragraph(line) for line in sentences), sections)
 
 
 def tables_of(difference: Difference) -> list[Table]:
-    """Means and medians of every measure in both files, and their deltas: shares first, then errors."""
+    """Means and medians of every measure in both files, and their deltas: fractions first, then errors."""
     a, b = difference.sides.a.name, difference.sides.b.name
-    shares = {name: measure for name, measure in MEASURES.items() if not measure.unit}
+    fractions = {name: measure for name, measure in MEASURES.items() if not measure.unit}
     errors = {name: measure for name, measure in MEASURES.items() if measure.unit}
     delta = (
-        f"A delta is {b} minus {a} of one pose; the last column is the median of the deltas, not the difference of the "
+        f"A delta is {b} minus {a} of a pose; the last column is the median of the deltas, not the difference of the "
         f"medians. 95 % intervals by resampling {difference.resampled}."
     )
     fails = f"A pose fails with an ADD(-S) of {difference.limit_diameters:g} diameter or more."
     return [
-        _table(difference, "Shares", shares, f"{delta} A missing estimate counts as 0. {fails}"),
+        _table(difference, "Fractions", fractions, f"{delta} A missing estimate counts as 0. {fails}"),
         _table(difference, "Errors", errors, f"{delta} Over the poses found in both files."),
     ]
 
@@ -72,11 +72,11 @@ def _table(difference: Difference, kind: str, measures: Mapping[str, Measure], n
     a, b = difference.sides.a.name, difference.sides.b.name
     digits = max(measure.digits for measure in measures.values())
     columns = [
-        Column(key="measure", heading="measure"),
-        Column(key="about", heading="what it is"),
-        Column(key="poses", heading="poses", digits=0),
+        TableColumn(key="measure", heading="measure"),
+        TableColumn(key="about", heading="meaning"),
+        TableColumn(key="poses", heading="poses", digits=0),
         *[
-            Column(key=f"{statistic}_{side}", heading=heading, group=statistic, digits=digits)
+            TableColumn(key=f"{statistic}_{side}", heading=heading, group=statistic, digits=digits)
             for statistic in ("mean", "median")
             for side, heading in (("a", a), ("b", b), ("delta", "delta"))
         ],
@@ -88,7 +88,7 @@ def _table(difference: Difference, kind: str, measures: Mapping[str, Measure], n
         cells: dict[str, Cell] = {"measure": label, "about": measure.text, "poses": change.poses}
         cells |= {"mean_a": change.mean_a, "mean_b": change.mean_b}
         cells["mean_delta"] = _with_ends(change.mean_delta, change.mean_interval)
-        if not measure.yes_or_no:
+        if not measure.is_binary:
             cells |= {"median_a": change.median_a, "median_b": change.median_b}
             cells["median_delta"] = _with_ends(change.median_delta, change.median_interval)
         rows.append(Row(cells=cells))
@@ -106,7 +106,7 @@ def _changed(difference: Difference, rows: pd.DataFrame, pictures: int) -> list[
     shown = _pictures(difference, rows.head(pictures))
     parts = [html.paragraph(f"{len(rows)} poses, the largest changes of ADD(-S) first.", soft=True), *shown]
     if difference.sides.evaluator is None:
-        parts.append(html.paragraph("No pictures: a table of errors holds no poses.", soft=True))
+        parts.append(html.paragraph("No pictures: an error table has no poses.", soft=True))
     return [*parts, html.fold(f"All {len(rows)} ({IDS})", *_listed(rows))]
 
 

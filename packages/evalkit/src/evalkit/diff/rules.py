@@ -1,4 +1,4 @@
-"""Rules such as `vss < -0.01` that say when a difference is too bad: for `--fail-if` and continuous integration."""
+"""Rules such as `vss < -0.01` for unacceptable differences: for `--fail-if` and continuous integration."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ COUNTS: Mapping[str, str] = {
     "newly_solved": "poses failed in A and solved in B",
     "lost": "poses found in A only",
     "gained": "poses found in B only",
-    "unpaired": "poses that only one of the files is asked for",
+    "unpaired": "poses expected in only one file",
 }
 Statistic = Literal["mean", "median", "lower", "upper"]
 STATISTICS: Mapping[Statistic, str] = {
@@ -38,7 +38,7 @@ class Rule:
     """A rule.
 
     Attributes:
-        text: as it was written.
+        text: as written.
         statistic: of a measure's deltas.
         name: a measure, or a count.
         operator: of `OPERATORS`.
@@ -54,7 +54,7 @@ class Rule:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """What became of a rule: its value (NaN where there is none to judge by) and whether it fired."""
+    """Result of a rule: its value (NaN for none) and whether the rule fired."""
 
     rule: Rule
     value: float
@@ -73,30 +73,30 @@ def parse_rule(text: str) -> Rule:
     """Read `NAME OPERATOR NUMBER` or `STATISTIC(NAME) OPERATOR NUMBER`.
 
     Raises:
-        ConfigError: it is no such rule, or its name or statistic is unknown; the message lists what there is.
+        ConfigError: the text is no rule, or its name or statistic is unknown; the message lists the valid ones.
     """
     match = RULE.fullmatch(text)
     if match is None:
         raise ConfigError(
             f"--fail-if '{text}': expected NAME OPERATOR NUMBER such as 'vss < -0.01' or 'lower(recall) < -0.02'; "
-            f"operators are {', '.join(OPERATORS)}; {_known()}"
+            f"operators are {', '.join(OPERATORS)}; {_names()}"
         )
     statistic, name = match["statistic"] or "mean", match["inner"] or match["name"]
     if statistic not in STATISTICS or name not in (*MEASURES, *COUNTS):
         unknown = statistic if statistic not in STATISTICS else name
-        raise ConfigError(f"--fail-if '{text}': '{unknown}' is unknown; {_known()}")
+        raise ConfigError(f"--fail-if '{text}': '{unknown}' is unknown; {_names()}")
     if name in COUNTS and match["statistic"]:
         raise ConfigError(f"--fail-if '{text}': {name} is a number of poses; write '{name} {match['operator']} N'")
-    chosen: Statistic = next(known for known in STATISTICS if known == statistic)
+    chosen: Statistic = next(statistic_name for statistic_name in STATISTICS if statistic_name == statistic)
     return Rule(text=text.strip(), statistic=chosen, name=name, operator=match["operator"], limit=float(match["limit"]))
 
 
-def _known() -> str:
+def _names() -> str:
     return f"names are {', '.join((*MEASURES, *COUNTS))}; statistics are {', '.join(STATISTICS)}"
 
 
 def judge(rules: Sequence[Rule], difference: Difference) -> list[Verdict]:
-    """Judge rules. One without a value to judge by (nothing found in both, no interval) counts as fired."""
+    """Verdicts on rules. A rule without a value (nothing found in both, no interval) counts as fired."""
     verdicts = []
     for rule in rules:
         value = _value(rule, difference)

@@ -1,4 +1,4 @@
-"""The two files that are compared: BOP result files, or tables of errors that `evalkit report` wrote."""
+"""The two files of a comparison: BOP result files, or error tables (`estimates.csv`) of `evalkit report`."""
 
 import csv
 from collections.abc import Iterator, Sequence
@@ -11,25 +11,25 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
 
-from evalkit.error_table import COLUMNS
+from evalkit.error_table import COLUMNS, RENAMED_COLUMNS
 from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.result_files import dataset_of, load_result_files
 
 NAMES_COLUMN = "results"
-"""Of a table of errors: which result file a line is of."""
+"""Column of an error table with the result file's name."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Side:
-    """One of the two.
+    """One file of a comparison.
 
     Attributes:
-        name: what tables call it.
-        path: where it lies.
+        name: for tables.
+        path: of the file.
         sha256: of its bytes.
         table: its errors, see `evalkit.error_table`.
-        scored: the same with its poses; None where only a table of errors was given.
+        scored: the same with its poses; None for an error table.
     """
 
     name: str
@@ -41,7 +41,7 @@ class Side:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sides:
-    """Both, the first the one that the second is compared with, and the evaluator, where poses were evaluated."""
+    """Reference `a`, compared file `b`, and the evaluator unless both are error tables."""
 
     a: Side
     b: Side
@@ -62,8 +62,8 @@ def open_sides(
 
     Args:
         paths: each a BOP result file or an `estimates.csv` of a report.
-        results: which result file of a table of errors is meant, where it holds several.
-        dataset: folder; by default the one that the result files' sidecars name. Tables of errors need none.
+        results: names of the result files within error tables that hold several.
+        dataset: folder; by default the one that the result files' sidecars name. Error tables need none.
         split: of the dataset.
         vss: whole silhouettes or visible parts.
         workers: number of processes that score poses.
@@ -72,7 +72,7 @@ def open_sides(
         PoseError: a file or the dataset is not usable; the message names it.
     """
     tables = [
-        read_errors(path, name) if is_table_of_errors(path) else None for path, name in zip(paths, results, strict=True)
+        read_errors(path, name) if is_error_table(path) else None for path, name in zip(paths, results, strict=True)
     ]
     to_score = list(dict.fromkeys(path for path, side in zip(paths, tables, strict=True) if side is None))
     if not to_score:
@@ -81,7 +81,7 @@ def open_sides(
         return
     for path, name, side in zip(paths, results, tables, strict=True):
         if side is None and name is not None:
-            raise ConfigError(f"{path}: is a result file, which holds no '{name}'; leave --result-a and --result-b out")
+            raise ConfigError(f"{path}: is a result file, which has no '{name}'; leave --result-a and --result-b out")
     opened = BopDataset(dataset or dataset_of(to_score, Path()), split)
     with Evaluator(opened, vss, workers=workers) as evaluator:
         scored = {file.path: score_file(evaluator, file) for file in load_result_files(to_score, opened)}
@@ -96,7 +96,7 @@ def _side_of(scored: Scored) -> Side:
 
 
 def _renamed(sides: Sequence[Side]) -> tuple[Side, Side]:
-    """Names that differ."""
+    """Both sides under different names."""
     a, b = sides
     if a.name != b.name:
         return a, b
@@ -107,7 +107,7 @@ def _named(side: Side, name: str) -> Side:
     return Side(name=name, path=side.path, sha256=side.sha256, table=side.table, scored=side.scored)
 
 
-def is_table_of_errors(path: Path) -> bool:
+def is_error_table(path: Path) -> bool:
     """Whether a file is an `estimates.csv` of a report, by its first line.
 
     Raises:
@@ -124,21 +124,21 @@ def is_table_of_errors(path: Path) -> bool:
 
 
 def read_errors(path: Path, name: str | None = None) -> Side:
-    """Read the lines of one result file from a table of errors.
+    """Read the rows of a result file from an error table.
 
     Args:
         path: an `estimates.csv` of a report.
-        name: of the result file, as the table's column `results` has it. Not needed where there is one only.
+        name: of the result file in the table's column `results`; not needed for a single one.
 
     Raises:
-        ResultFileError: columns are missing, or a line holds something else than numbers.
-        ConfigError: the table holds several result files and none is named, or not this one.
+        ResultFileError: columns are missing, or a value is no number.
+        ConfigError: the table holds several result files and `name` is None or none of their names.
     """
     rows = _rows(path)
     named = rows[NAMES_COLUMN] if NAMES_COLUMN in rows else pd.Series(path.stem, index=rows.index)
     names = list(dict.fromkeys(named))
     if name is None and len(names) > 1:
-        raise ConfigError(f"{path}: holds {', '.join(names)}; say which with --result-a and --result-b")
+        raise ConfigError(f"{path}: holds {', '.join(names)}; name one with --result-a and --result-b")
     if name is not None and name not in names:
         raise ConfigError(f"{path}: has no result file '{name}'; it holds {', '.join(names)}")
     chosen = name or (names[0] if names else path.stem)
@@ -156,7 +156,7 @@ def _rows(path: Path) -> pd.DataFrame:
             lines = list(csv.reader(stream))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ResultFileError(f"{path}: cannot be read as CSV ({error})") from error
-    head = [name.strip() for name in lines[0]]
+    head = [RENAMED_COLUMNS.get(name, name) for name in map(str.strip, lines[0])]
     body = {number: line for number, line in enumerate(lines[1:], start=2) if any(part.strip() for part in line)}
     for number, line in body.items():
         if len(line) != len(head):
@@ -170,7 +170,7 @@ def _rows(path: Path) -> pd.DataFrame:
 
 
 def _typed(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
-    """Numbers; the index holds line numbers until here."""
+    """The table with numbers; the index of `rows` holds line numbers."""
     table = pd.DataFrame(index=rows.index)
     for name in rows.columns:
         text = rows[name].str.strip()
@@ -183,7 +183,7 @@ def _typed(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
             wrong |= ~numbers.isin([0, 1])
         wrong &= text.str.lower() != "nan"
         if wrong.any() and name not in COLUMNS:
-            continue  # a column of words that a report added
+            continue  # a column of words
         if wrong.any():
             line = int(wrong.idxmax())
             expected = {"float64": "a number", "int64": "a whole number", "bool": "0 or 1"}[dtype]

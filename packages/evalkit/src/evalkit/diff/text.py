@@ -21,19 +21,18 @@ IDS = "scene/image/object/instance"
 
 
 def text(difference: Difference, listed: int) -> str:
-    """Both files, a table of all measures, and the poses whose verdict changed, the largest changes first."""
+    """Both files, a table of all measures, and the poses with another verdict, the largest changes first."""
     sides, counts = difference.sides, difference.counts
     lines = [f"A  {_about(sides.a)}", f"B  {_about(sides.b)}", ""]
     lines += _table(difference)
     lines += [
         "",
         f"delta is B minus A of each pose; 95 % intervals by resampling {difference.resampled}.",
-        "Shares (no unit) and VSS count a missing estimate as 0; errors are over the poses found in both.",
+        "Fractions (no unit) and VSS count a missing estimate as 0; errors are over the poses found in both.",
     ]
     if counts["unpaired"]:
         lines.append(
-            f"Left out: {len(difference.only_a)} poses that only A is asked for, "
-            f"{len(difference.only_b)} that only B is."
+            f"Left out: {len(difference.only_a)} poses expected of A only, {len(difference.only_b)} of B only."
         )
     for title, rows in (
         (f"Newly failed (ADD(-S) of {difference.limit_diameters:g} diameter or more)", difference.newly_failed),
@@ -76,7 +75,7 @@ def _cells(change: Change, measure: Measure) -> tuple[str, ...]:
         _number(change.mean_delta, digits, sign="+"),
     )
     cells = (str(change.poses), *means, _ends(change.mean_interval, digits))
-    if measure.yes_or_no:
+    if measure.is_binary:
         return (*cells, *[NOTHING] * 4)
     medians = (change.median_a, change.median_b)
     return (
@@ -98,11 +97,11 @@ def _ends(interval: Interval, digits: int) -> str:
 
 
 def line_of(row: dict[str, Any]) -> str:
-    """A pose whose verdict changed, in one line."""
+    """A pose with another verdict, in one line."""
     ids = "/".join(str(row[name]) for name in KEY)
     level = ""
-    if row["start_angle_deg"] == row["start_angle_deg"]:
-        level = f" start {row['start_angle_deg']:g} deg {row['start_translation_diameter']:g} d"
+    if row["initial_angle_deg"] == row["initial_angle_deg"]:
+        level = f" initial pose {row['initial_angle_deg']:g} deg {row['initial_translation_diameter']:g} d"
     add = f"ADD(-S) {_millimetres(row['add_s_a'])} to {_millimetres(row['add_s_b'])}"
     vss = f"VSS {row['vss_a']:.3f} to {row['vss_b']:.3f}"
     why = [f"{side}: {cause}" for side, cause in (("A", row.get("cause_a")), ("B", row.get("cause_b"))) if cause]
@@ -115,7 +114,7 @@ def _millimetres(value: float) -> str:
 
 
 def json_text(difference: Difference, verdicts: Sequence[Verdict] = ()) -> str:
-    """All of a difference as JSON; values without data are null."""
+    """A difference as JSON; values without data are null."""
     pairs = difference.pairs
     content = {
         "a": _side(difference.sides.a),

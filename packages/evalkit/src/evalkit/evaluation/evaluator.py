@@ -1,4 +1,4 @@
-"""Dataset and result files to a table: one row for every expected pose, found or missing."""
+"""From a dataset and result files to the error table: one row for every expected pose, found or missing."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -19,18 +19,18 @@ from posecore.processes import behave_as_worker, spawned
 from posecore.raster import Rasteriser
 
 from evalkit.error_table import table_of
-from evalkit.inputs.pairing import Pair, pair_up
+from evalkit.inputs.pairing import MatchedPose, pair_up
 from evalkit.inputs.result_files import load_result_files
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.pose_errors.scorer import Scorer
 from evalkit.scores.bop_matching import AllErrors, with_bop19
-from evalkit.scores.definitions import VSD_COLUMNS
 
 VssKind = Literal["full", "visible"]
 Progress = Callable[[int], None]
 BLOCK = 1024
-"""Number of pairs whose renders are held at once, and that a worker gets at once."""
+"""Number of pairs in a block: the renders held at once, and one task of a worker."""
 
-TRUTH_COLUMNS = (
+INSTANCE_COLUMNS = (
     *("scene_id", "im_id", "obj_id", "gt_index", "visib_fract"),
     *("inst_count", "diameter_m", "image_width_px"),
 )
@@ -41,19 +41,19 @@ def evaluate(
 ) -> pd.DataFrame:
     """Errors of the poses in a result file: one row for each expected pose, found or missing.
 
-    `evalkit.scores.scores(table)` sums them up; `evalkit.error_table.COLUMNS` says what each column holds, with its
-    unit.
-    Beside those columns stand `vsd_0.05` ... `vsd_0.50` where images have depth (VSD at these tolerances in diameters,
-    NaN for images without), and `bop19_mssd`, `bop19_mspd` and, where all images have depth, `bop19_vsd`: the share of
-    BOP19's thresholds at which BOP's matching gives the instance an estimate. Files of perturbed starts have none.
+    `evalkit.scores.scores(table)` gives means, medians and recalls; `evalkit.error_table.COLUMNS` describes each column
+    with its unit. Further columns are `vsd_0.05` ... `vsd_0.50` where images have depth (VSD at these tolerances in
+    diameters, NaN for images without), and `bop19_mssd`, `bop19_mspd` and, where all images have depth, `bop19_vsd`:
+    the fraction of BOP19's thresholds at which BOP's matching assigns an estimate to the instance. Files of perturbed
+    initial poses have no `bop19_*` columns.
 
     Args:
         dataset: folder in BOP format with ground truth.
         results: BOP result file (CSV), translations in millimetres.
         vss: whole silhouettes, or their visible parts, which needs depth images.
         with_vsd: whether VSD is computed where there is depth.
-        workers: number of processes; the values do not depend on it. They import the script that calls this, which
-            therefore has to do so under `if __name__ == "__main__":`.
+        workers: number of processes; the values do not depend on it. They import the calling script, which therefore
+            has to call this function under `if __name__ == "__main__":`.
 
     Raises:
         PoseError: a file or the dataset is not usable; the message names it.
@@ -65,11 +65,11 @@ def evaluate(
         table = evaluator.evaluate(pairs)
         if "perturbation" in file.sidecar:
             return table
-        return with_bop19(table, evaluator.all_errors(file.estimates, known=(pairs, table)))
+        return with_bop19(table, evaluator.all_errors(file.estimates, scored=(pairs, table)))
 
 
 class Evaluator:
-    """Scores pairs against one dataset; true silhouettes are rendered once for all result files."""
+    """Errors of pairs against one dataset; ground-truth silhouettes are rendered once for all result files."""
 
     def __init__(self, dataset: BopDataset, vss: VssKind = "full", *, with_vsd: bool = True, workers: int = 1) -> None:
         """Open a renderer for the dataset's models (`models_eval` where there is one).
@@ -96,16 +96,16 @@ class Evaluator:
 
     @property
     def rasteriser(self) -> Rasteriser:
-        """Has the meshes of all objects asked for so far."""
+        """Renderer with the meshes of all objects scored so far."""
         return self._scorer.rasteriser
 
-    def evaluate(self, pairs: Sequence[Pair], advance: Progress = lambda done: None) -> pd.DataFrame:
+    def evaluate(self, pairs: Sequence[MatchedPose], advance: Progress = lambda done: None) -> pd.DataFrame:
         """Score pairs, in their order; `advance` is called with the number of pairs done since the last call.
 
         Memory beside the table does not grow with the number of pairs: they are scored in blocks, image by image.
 
         Raises:
-            DatasetError: a model is missing, or VSS of visible parts is wanted and an image has no depth.
+            DatasetError: a model is missing, or VSS of visible parts needs depth that an image does not have.
         """
         if not pairs:
             return table_of({})
@@ -113,8 +113,8 @@ class Evaluator:
         size = min(BLOCK, -(-len(pairs) // self.workers))
         blocks = [[pairs[index] for index in order[start : start + size]] for start in range(0, len(pairs), size)]
         parts: list[pd.DataFrame | None] = [None] * len(blocks)
-        for place, part in self._scored(blocks):
-            parts[place] = part
+        for number, part in self._scored(blocks):
+            parts[number] = part
             advance(len(part))
         table = pd.concat([part for part in parts if part is not None], ignore_index=True)
         table = table.iloc[np.argsort(order)].reset_index(drop=True)
@@ -122,24 +122,24 @@ class Evaluator:
             table = table.drop(columns=list(VSD_COLUMNS))
         return table
 
-    def _scored(self, blocks: Sequence[Sequence[Pair]]) -> Iterator[tuple[int, pd.DataFrame]]:
-        """Each block's place and its table, as they are done."""
+    def _scored(self, blocks: Sequence[Sequence[MatchedPose]]) -> Iterator[tuple[int, pd.DataFrame]]:
+        """Each block's number and its table, in order of completion."""
         if self.workers == 1 or len(blocks) == 1:
-            yield from ((place, self._scorer.score(block)) for place, block in enumerate(blocks))
+            yield from ((number, self._scorer.score(block)) for number, block in enumerate(blocks))
             return
         died = (
             f"a process that scored {self.dataset.root} died (out of memory, or a crash in the renderer); "
             "start the same command again with fewer --workers"
         )
         if self._pool is None:
-            given = (self.dataset.root, self.dataset.split, self.dataset.sensor, self.vss, self.with_vsd)
-            self._pool = self._closing.enter_context(spawned(self.workers, _start_worker, given, died))
+            arguments = (self.dataset.root, self.dataset.split, self.dataset.sensor, self.vss, self.with_vsd)
+            self._pool = self._closing.enter_context(spawned(self.workers, _start_worker, arguments, died))
         waiting = dict(reversed(list(enumerate(blocks))))
         running: dict[Future[pd.DataFrame], int] = {}
         while waiting or running:
             while waiting and len(running) <= self.workers:  # one more than run, so that none waits for its pairs
-                place, block = waiting.popitem()
-                running[self._pool.submit(_score_in_worker, block)] = place
+                number, block = waiting.popitem()
+                running[self._pool.submit(_score_in_worker, block)] = number
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 try:
                     yield running.pop(future), future.result()
@@ -147,68 +147,63 @@ class Evaluator:
                     raise RenderError(died) from error
 
     def all_errors(
-        self, estimates: Sequence[Estimate], known: tuple[Sequence[Pair], pd.DataFrame] | None = None
+        self, estimates: Sequence[Estimate], scored: tuple[Sequence[MatchedPose], pd.DataFrame] | None = None
     ) -> AllErrors:
-        """Every estimate in the targets' images against every true instance of its object: what BOP19 and BOP24 match.
+        """Every estimate in the targets' images against every instance of its object, for BOP19's and BOP24's matching.
 
         Args:
             estimates: of a result file; those in other images are left out.
-            known: pairs of these estimates that were scored before, and what `evaluate` returned for them.
+            scored: pairs of these estimates scored before, and the table that `evaluate` returned for the pairs.
         """
-        asked = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in self.dataset.targets}
-        images = list(dict.fromkeys(key[:2] for key in asked))
-        truths = [
+        counts = {(t.scene_id, t.im_id, t.obj_id): t.inst_count for t in self.dataset.targets}
+        images = list(dict.fromkeys(key[:2] for key in counts))
+        instances = [
             (*image, gt)
             for image in images
             for gt in self._scorer.gt(*image)
             if gt.has_pose and gt.obj_id in self.dataset.models_info
         ]
-        wanted = set(images)
-        kept = [estimate for estimate in estimates if (estimate.scene_id, estimate.im_id) in wanted]
-        places: dict[tuple[int, int, int], list[int]] = defaultdict(list)
-        for place, (scene_id, im_id, gt) in enumerate(truths):
-            places[scene_id, im_id, gt.obj_id].append(place)
-        pairs, ends = [], []
-        for index, estimate in enumerate(kept):
-            for place in places.get((estimate.scene_id, estimate.im_id, estimate.obj_id), []):
-                scene_id, im_id, gt = truths[place]
-                pairs.append(Pair(scene_id=scene_id, im_id=im_id, truth=gt, estimate=estimate))
-                ends.append((index, place))
-        errors = self._reusing(pairs, known)
+        image_set = set(images)
+        kept = [estimate for estimate in estimates if (estimate.scene_id, estimate.im_id) in image_set]
+        pairs, indices = _all_pairs(kept, instances)
+        errors = self._reusing(pairs, scored)
         columns = ["mssd_m", "mspd_px", *(name for name in VSD_COLUMNS if name in errors)]
         errors = errors[columns].copy()
         if not errors.reindex(columns=list(VSD_COLUMNS)).notna().all(axis=None):
             errors = errors[["mssd_m", "mspd_px"]]  # images without depth: no recall of VSD
-        errors.insert(0, "estimate", np.array([end[0] for end in ends], np.int64))
-        errors.insert(1, "truth", np.array([end[1] for end in ends], np.int64))
+        errors.insert(0, "estimate", np.array([estimate for estimate, _ in indices], np.int64))
+        errors.insert(1, "instance", np.array([instance for _, instance in indices], np.int64))
         return AllErrors(
             estimates=pd.DataFrame(
                 [(e.scene_id, e.im_id, e.obj_id, e.line, e.score) for e in kept],
                 columns=["scene_id", "im_id", "obj_id", "line", "score"],
             ),
-            truths=pd.DataFrame(
-                [self._truth_row(scene_id, im_id, gt, asked) for scene_id, im_id, gt in truths],
-                columns=list(TRUTH_COLUMNS),
+            instances=pd.DataFrame(
+                [self._instance_row(scene_id, im_id, gt, counts) for scene_id, im_id, gt in instances],
+                columns=list(INSTANCE_COLUMNS),
             ),
             errors=errors,
         )
 
-    def _reusing(self, pairs: Sequence[Pair], known: tuple[Sequence[Pair], pd.DataFrame] | None) -> pd.DataFrame:
-        """`evaluate`, with the rows of pairs that are known taken over."""
-        if known is None:
+    def _reusing(
+        self, pairs: Sequence[MatchedPose], scored: tuple[Sequence[MatchedPose], pd.DataFrame] | None
+    ) -> pd.DataFrame:
+        """`evaluate`, with the rows of pairs scored before taken over."""
+        if scored is None:
             return self.evaluate(pairs)
-        rows = {(id(pair.estimate), pair.truth.gt_index): row for row, pair in enumerate(known[0]) if pair.estimate}
-        found = [rows.get((id(pair.estimate), pair.truth.gt_index), -1) for pair in pairs]
-        fresh = self.evaluate([pair for pair, row in zip(pairs, found, strict=True) if row < 0])
-        place = np.array(found, np.int64)
-        place[place < 0] = len(known[1]) + np.arange(len(fresh))
-        return pd.concat([known[1], fresh], ignore_index=True).iloc[place].reset_index(drop=True)
+        before, table = scored
+        rows = {(id(pair.estimate), pair.gt.gt_index): row for row, pair in enumerate(before) if pair.estimate}
+        row_of_pair = np.array([rows.get((id(pair.estimate), pair.gt.gt_index), -1) for pair in pairs], np.int64)
+        is_new = row_of_pair < 0
+        new = self.evaluate([pair for pair, needed in zip(pairs, is_new.tolist(), strict=True) if needed])
+        row_of_pair[is_new] = len(table) + np.arange(len(new))
+        return pd.concat([table, new], ignore_index=True).iloc[row_of_pair].reset_index(drop=True)
 
-    def _truth_row(
-        self, scene_id: int, im_id: int, gt: GroundTruth, asked: Mapping[tuple[int, int, int], int]
+    def _instance_row(
+        self, scene_id: int, im_id: int, gt: GroundTruth, counts: Mapping[tuple[int, int, int], int]
     ) -> tuple[Any, ...]:
         visible = np.nan if gt.visib_fract is None else gt.visib_fract
-        count = asked.get((scene_id, im_id, gt.obj_id), 0)
+        count = counts.get((scene_id, im_id, gt.obj_id), 0)
         diameter_m = self.dataset.models_info[gt.obj_id].diameter_m
         width_px = self.camera(scene_id, im_id).width_px
         return scene_id, im_id, gt.obj_id, gt.gt_index, visible, count, diameter_m, width_px
@@ -222,6 +217,22 @@ class Evaluator:
         return self._scorer.model(obj_id).mesh
 
 
+def _all_pairs(
+    estimates: Sequence[Estimate], instances: Sequence[tuple[int, int, GroundTruth]]
+) -> tuple[list[MatchedPose], list[tuple[int, int]]]:
+    """Every estimate with every instance of its object in its image, and the indices of both."""
+    by_target: dict[tuple[int, int, int], list[int]] = defaultdict(list)
+    for index, (scene_id, im_id, gt) in enumerate(instances):
+        by_target[scene_id, im_id, gt.obj_id].append(index)
+    pairs, indices = [], []
+    for number, estimate in enumerate(estimates):
+        for index in by_target.get((estimate.scene_id, estimate.im_id, estimate.obj_id), []):
+            scene_id, im_id, gt = instances[index]
+            pairs.append(MatchedPose(scene_id=scene_id, im_id=im_id, gt=gt, estimate=estimate))
+            indices.append((number, index))
+    return pairs, indices
+
+
 _worker: Scorer | None = None
 
 
@@ -231,6 +242,6 @@ def _start_worker(root: Path, split: str, sensor: str | None, vss: VssKind, with
     _worker = Scorer(BopDataset(root, split, sensor), visible=vss == "visible", with_vsd=with_vsd)
 
 
-def _score_in_worker(block: Sequence[Pair]) -> pd.DataFrame:
+def _score_in_worker(block: Sequence[MatchedPose]) -> pd.DataFrame:
     assert _worker is not None
     return _worker.score(block)

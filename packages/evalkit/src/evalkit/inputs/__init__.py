@@ -1,1 +1,1 @@
-"""Result files, the ground truth they are matched with, and initial poses at known distances from it."""
+"""Result files, their matching with ground truth, and initial poses at known distances from the ground truth."""

@@ -1,4 +1,4 @@
-"""Start poses from ground truth: rotated and moved by known amounts, so that convergence can be drawn as a curve."""
+"""Initial poses at known rotations and translations from the ground truth, for convergence curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,19 +11,19 @@ from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth, write_res
 from posecore.errors import ConfigError
 
 from evalkit import __version__
-from evalkit.inputs.pairing import Level, truths_of
+from evalkit.inputs.pairing import Level, instances_of
 from evalkit.inputs.result_files import INITIAL_METHOD
 
 
 @dataclass(frozen=True, kw_only=True)
 class Protocol:
-    """A published experiment: its levels, and what it asks of the refiner.
+    """A published experiment: its levels, and its number of refinement iterations.
 
     Attributes:
-        angles_deg: one start for each, not moved.
-        translations_diameter: one start for each, not rotated.
+        angles_deg: one initial pose for each, not translated.
+        translations_diameter: one initial pose for each, not rotated.
         iterations: of the refiner.
-        source: where it is described.
+        source: publication.
     """
 
     angles_deg: tuple[float, ...]
@@ -40,14 +40,72 @@ PROTOCOLS: Mapping[str, Protocol] = {
         source="Deep Model-Based 6D Pose Refinement in RGB, ECCV 2018, section 4.1 and figure 4",
     )
 }
-"""The paper says 5 to 45 degrees and 0 to 1 diameters; the steps of 5 degrees and 0.1 diameters are ours."""
+"""The ranges, 5 to 45 degrees and 0 to 1 diameters, are the paper's; the steps, 5 degrees and 0.1 diameters, ours."""
 
 
-def departures(sidecar: Mapping[str, Any]) -> list[str]:
-    """In what a result file from perturbed starts departs from their protocol, a sentence each; empty where in nothing.
+@dataclass(frozen=True, kw_only=True)
+class PerturbJob:
+    """A file of initial poses to make.
+
+    Attributes:
+        dataset: BOP folder with ground truth.
+        out: result file to write; its sidecar goes beside it.
+        split: of the dataset.
+        protocol: name of a `PROTOCOLS` entry that gives the levels, None for the two below.
+        angles_deg: one initial pose for each.
+        translations_diameter: one initial pose for each.
+        random_up_to: one more initial pose, angle and length drawn uniformly from 0 up to these; None for none.
+        depth_stretch: factor on the part of the random initial pose's translation along the viewing ray, 1 or more.
+        seed: of all draws.
+    """
+
+    dataset: Path
+    out: Path
+    split: str | None = None
+    protocol: str | None = None
+    angles_deg: tuple[float, ...] = ()
+    translations_diameter: tuple[float, ...] = ()
+    random_up_to: Level | None = None
+    depth_stretch: float = 1.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.protocol is not None and (self.angles_deg or self.translations_diameter):
+            raise ConfigError(
+                f"--protocol {self.protocol} brings its own levels; leave --angles and --translations away"
+            )
+        if self.depth_stretch != 1 and not (self.random_up_to and self.random_up_to.translation_diameter):
+            raise ConfigError("--depth-stretch needs a random initial pose; give --random-translation too")
+
+    @property
+    def levels(self) -> list[Level]:
+        """Levels of every target."""
+        protocol = PROTOCOLS[self.protocol] if self.protocol is not None else self
+        return levels_of(protocol.angles_deg, protocol.translations_diameter)
+
+
+def write_initial_poses(job: PerturbJob) -> int:
+    """Write the result file of a job and its sidecar; the number of its lines.
+
+    Raises:
+        PoseError: the dataset or the job's levels are not usable; the message names them.
+    """
+    return perturb_dataset(
+        BopDataset(job.dataset, job.split),
+        job.out,
+        levels=job.levels,
+        seed=job.seed,
+        random_up_to=job.random_up_to,
+        depth_stretch=job.depth_stretch,
+        protocol=job.protocol,
+    )
+
+
+def protocol_deviations(sidecar: Mapping[str, Any]) -> list[str]:
+    """Deviations of a refined result file from the protocol of its initial poses, a sentence each.
 
     Args:
-        sidecar: of the refined file, which carries the starts' `perturbation`.
+        sidecar: of the refined file, with the initial poses' `perturbation`.
     """
     perturbation, settings = sidecar.get("perturbation"), sidecar.get("settings")
     name = perturbation.get("protocol") if isinstance(perturbation, dict) else None
@@ -66,10 +124,10 @@ def levels_of(angles_deg: Sequence[float], translations_diameter: Sequence[float
     """
     if any(not 0 <= angle <= 180 for angle in angles_deg):
         raise ConfigError(f"--angles: found {_listed(angles_deg)}, expected degrees from 0 to 180")
-    if any(not (np.isfinite(share) and share >= 0) for share in translations_diameter):
+    if any(not (np.isfinite(distance) and distance >= 0) for distance in translations_diameter):
         raise ConfigError(f"--translations: found {_listed(translations_diameter)}, expected diameters, 0 or more")
     levels = [Level(angle_deg=angle, translation_diameter=0.0) for angle in angles_deg]
-    levels += [Level(angle_deg=0.0, translation_diameter=share) for share in translations_diameter]
+    levels += [Level(angle_deg=0.0, translation_diameter=distance) for distance in translations_diameter]
     return list(dict.fromkeys(levels))
 
 
@@ -83,25 +141,26 @@ def perturb_dataset(
     depth_stretch: float = 1.0,
     protocol: str | None = None,
 ) -> int:
-    """Write start poses for every target, and in the sidecar the level of every line.
+    """Write initial poses for every target, and in the sidecar the level of every line.
 
-    A pose is rotated by exactly its angle about a random axis through the object's origin (in camera axes) and moved
-    by exactly its length in a random direction. Randomness depends on the seed, the target's ids and the levels before.
+    A pose is rotated by exactly its angle about a random axis through the object's origin (in camera axes) and
+    translated by exactly its length in a random direction. The draws depend on the seed, the target's ids and the
+    previous levels.
 
     Args:
         dataset: with ground truth.
         out: result file.
         levels: levels for every target, one line each.
         seed: of all draws.
-        random_up_to: where given, one more line for each target, its angle and length drawn evenly from 0 up to these.
-        depth_stretch: factor on the part of the random line's move along the viewing ray; its level is what comes out.
-        protocol: name of the `PROTOCOLS` entry that the levels are of, for the sidecar.
+        random_up_to: one more line for each target, angle and length drawn uniformly from 0 up to these; None for none.
+        depth_stretch: factor on the random line's translation along the viewing ray; its level is the stretched one.
+        protocol: name of the levels' `PROTOCOLS` entry, for the sidecar.
 
     Returns:
         Number of lines.
 
     Raises:
-        ConfigError: neither levels nor random ones are wanted, or a start would lie behind the camera.
+        ConfigError: there are no levels, or an initial pose would lie behind the camera.
     """
     if not levels and random_up_to is None:
         raise ConfigError(
@@ -111,16 +170,16 @@ def perturb_dataset(
     rows: list[dict[str, Any]] = []
     for target in dataset.targets:
         diameter_m = dataset.models_info[target.obj_id].diameter_m
-        for truth in truths_of(dataset, target)[: target.inst_count]:
-            rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, truth.gt_index])
+        for gt in instances_of(dataset, target)[: target.inst_count]:
+            rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, gt.gt_index])
             drawn = [_drawn(random_up_to, rng)] if random_up_to else []
             for number, level in enumerate([*levels, *drawn]):
                 random = number >= len(levels)
-                start = _start(target, truth, level, diameter_m, rng)
+                initial = _perturbed(target, gt, level, diameter_m, rng)
                 if random and depth_stretch != 1:
-                    start, level = _stretched(start, truth, level, diameter_m, depth_stretch)
-                estimates.append(start)
-                rows.append(_sidecar_row(len(estimates) + 1, target, truth, level) | {"random": random})
+                    initial, level = _stretched(initial, gt, level, diameter_m, depth_stretch)
+                estimates.append(initial)
+                rows.append(_sidecar_row(len(estimates) + 1, target, gt, level) | {"random": random})
     sidecar = {
         "dataset": str(dataset.root.resolve()),
         "split": dataset.split,
@@ -139,39 +198,39 @@ def _drawn(limit: Level, rng: np.random.Generator) -> Level:
     )
 
 
-def _start(
-    target: BopTarget, truth: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator
+def _perturbed(
+    target: BopTarget, gt: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator
 ) -> Estimate:
     distance_m = level.translation_diameter * diameter_m
     return Estimate(
         scene_id=target.scene_id,
         im_id=target.im_id,
         obj_id=target.obj_id,
-        T_cam_obj=se3.perturb(truth.T_cam_obj, float(np.deg2rad(level.angle_deg)), distance_m, rng),
+        T_cam_obj=se3.perturb(gt.T_cam_obj, float(np.deg2rad(level.angle_deg)), distance_m, rng),
     )
 
 
 def _stretched(
-    start: Estimate, truth: GroundTruth, level: Level, diameter_m: float, factor: float
+    initial: Estimate, gt: GroundTruth, level: Level, diameter_m: float, factor: float
 ) -> tuple[Estimate, Level]:
-    """The start with its depth error times a factor, and its level."""
-    T = se3.stretched_along_ray(truth.T_cam_obj, start.T_cam_obj, factor)
+    """The initial pose with its depth error times a factor, and its level."""
+    T = se3.stretched_along_ray(gt.T_cam_obj, initial.T_cam_obj, factor)
     if T[2, 3] <= 0:
         raise ConfigError(
-            f"--depth-stretch {factor:g}: puts object {start.obj_id} of image {start.im_id}, scene {start.scene_id}, "
-            "behind the camera; lower it or --random-translation"
+            f"--depth-stretch {factor:g}: puts object {initial.obj_id} of image {initial.im_id}, "
+            f"scene {initial.scene_id}, behind the camera; lower it or --random-translation"
         )
-    moved = float(np.linalg.norm(T[:3, 3] - truth.T_cam_obj[:3, 3])) / diameter_m
-    return replace(start, T_cam_obj=T), replace(level, translation_diameter=moved)
+    distance_diameter = float(np.linalg.norm(T[:3, 3] - gt.T_cam_obj[:3, 3])) / diameter_m
+    return replace(initial, T_cam_obj=T), replace(level, translation_diameter=distance_diameter)
 
 
-def _sidecar_row(line: int, target: BopTarget, truth: GroundTruth, level: Level) -> dict[str, Any]:
+def _sidecar_row(line: int, target: BopTarget, gt: GroundTruth, level: Level) -> dict[str, Any]:
     return {
         "line": line,
         "scene_id": target.scene_id,
         "im_id": target.im_id,
         "obj_id": target.obj_id,
-        "gt_index": truth.gt_index,
+        "gt_index": gt.gt_index,
         "angle_deg": level.angle_deg,
         "translation_diameter": level.translation_diameter,
     }

@@ -1,4 +1,4 @@
-"""Which result files belong to a report, what their sidecars say, and which dataset they speak of."""
+"""Result files with their sidecars, names and dataset."""
 
 import logging
 from collections import Counter
@@ -14,6 +14,9 @@ from posecore.files import sha256_file
 log = logging.getLogger(__name__)
 
 INITIAL_METHOD = "initial"
+"""`method` in the sidecar of a file of initial poses."""
+UNREFINED = "no refinement"
+"""Name of the initial poses in tables, as in the 2018 paper's."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +24,10 @@ class ResultFile:
     """A result file that has been read.
 
     Attributes:
-        name: what tables and plots call it, unique in a report.
-        path: where it lies.
+        name: for tables and plots, unique in a report.
+        path: of the CSV file.
         sha256: of its bytes.
-        sidecar: what `<path>.json` says, empty where there is none.
+        sidecar: content of `<path>.json`, empty without one.
         estimates: its lines.
     """
 
@@ -35,25 +38,25 @@ class ResultFile:
     estimates: list[Estimate]
 
     @property
-    def is_start(self) -> bool:
-        """Whether these are the poses that the other files started from."""
+    def is_initial(self) -> bool:
+        """Whether the file holds the initial poses of the other files."""
         return self.sidecar.get("method") == INITIAL_METHOD
 
 
 def find_result_files(folder: Path, is_dataset_given: bool = False) -> list[Path]:
-    """Result files with a sidecar that names a dataset, in a folder and in its `results/`; others are told.
+    """Result files with a sidecar that names a dataset, in a folder and in its `results/`; the others are logged.
 
     Args:
-        folder: Where.
-        is_dataset_given: whether the dataset is known otherwise; then sidecars need not name one.
+        folder: to search.
+        is_dataset_given: whether the dataset is given; then sidecars need not name one.
 
     Raises:
         ConfigError: there are none.
         ResultFileError: a sidecar is damaged.
     """
-    found = [path for place in (folder, folder / "results") for path in sorted(place.glob("*.csv"))]
+    paths = [path for base in (folder, folder / "results") for path in sorted(base.glob("*.csv"))]
     with_sidecar = []
-    for path in found:
+    for path in paths:
         if sidecar_path(path).is_file():
             if is_dataset_given or (read_sidecar(path) or {}).get("dataset"):
                 with_sidecar.append(path)
@@ -78,21 +81,39 @@ def dataset_of(paths: Sequence[Path], folder: Path) -> Path:
         value = (read_sidecar(path) or {}).get("dataset")
         if not isinstance(value, str) or not value:
             continue
-        choices = [place / value for place in (folder, path.parent, path.parent.parent)]
+        choices = [base / value for base in (folder, path.parent, path.parent.parent)]
         existing = [choice for choice in choices if choice.is_dir()]
         if not existing:
             raise ConfigError(f"{sidecar_path(path)}: its dataset {value} is not a folder; name it with --dataset DIR")
         named.setdefault(existing[0].resolve(), path)
     if not named:
-        raise ConfigError(f"{paths[0]}: no sidecar says which dataset this is; name it with --dataset DIR")
+        raise ConfigError(f"{paths[0]}: no sidecar names the dataset; name it with --dataset DIR")
     if len(named) > 1:
         both = ", ".join(f"{path} ({dataset})" for dataset, path in named.items())
         raise ConfigError(f"the result files are of several datasets: {both}; report one with --dataset and --results")
     return next(iter(named))
 
 
+def open_dataset(
+    results: Sequence[Path], dataset: Path | None = None, split: str | None = None, folder: Path = Path()
+) -> tuple[BopDataset, list[Path]]:
+    """The dataset and the result files of a command.
+
+    Args:
+        results: result files; without any, those of `find_result_files`.
+        dataset: its folder; by default the one that the sidecars name.
+        split: of the dataset.
+        folder: searched for result files and relative dataset folders.
+
+    Raises:
+        PoseError: there is no result file or no dataset; the message names the missing one.
+    """
+    paths = list(results) or find_result_files(folder, dataset is not None)
+    return BopDataset(dataset or dataset_of(paths, folder), split), paths
+
+
 def load_result_files(paths: Sequence[Path], dataset: BopDataset) -> list[ResultFile]:
-    """Read and check result files: starts come first, the others stay in order.
+    """Read and check result files: initial poses first, the others in order.
 
     Raises:
         ResultFileError: a file breaks the format or is named twice.
@@ -118,20 +139,20 @@ def load_result_files(paths: Sequence[Path], dataset: BopDataset) -> list[Result
                 file.path,
                 left,
             )
-    return sorted(_share_levels(files), key=lambda file: not file.is_start)
+    return sorted(_with_levels(files), key=lambda file: not file.is_initial)
 
 
-def _share_levels(files: Sequence[ResultFile]) -> list[ResultFile]:
-    """Give the perturbation levels of start poses to files with a line for each start that do not say them."""
+def _with_levels(files: Sequence[ResultFile]) -> list[ResultFile]:
+    """Copy the perturbation of initial poses to files without one that have a line for each initial pose."""
     counts = [Counter((line.scene_id, line.im_id, line.obj_id) for line in file.estimates) for file in files]
-    starts = [
+    initial = [
         (file.sidecar["perturbation"], count)
         for file, count in zip(files, counts, strict=True)
-        if file.is_start and "perturbation" in file.sidecar
+        if file.is_initial and "perturbation" in file.sidecar
     ]
     shared = []
     for file, count in zip(files, counts, strict=True):
-        same = [levels for levels, planned in starts if planned == count]
+        same = [levels for levels, initial_count in initial if initial_count == count]
         lent = {"perturbation": same[0]} if same and "perturbation" not in file.sidecar else {}
         shared.append(replace(file, sidecar=file.sidecar | lent))
     return shared
@@ -143,3 +164,26 @@ def _unique_names(paths: Sequence[Path]) -> list[str]:
         return stems
     longer = [f"{path.resolve().parent.name}/{path.stem}" for path in paths]
     return longer if len(set(longer)) == len(longer) else [str(path) for path in paths]
+
+
+def method_names(files: Sequence[ResultFile]) -> list[str]:
+    """Unique names: sidecar's `method` and `loss`, `UNREFINED` for initial poses; the file's name where these fail.
+
+    The loss is `loss` in the sidecar or in its `settings`.
+    """
+    described = [_described(file) for file in files]
+    count = Counter(described)
+    return [
+        (f"{name} ({file.name})" if name else file.name) if count[name] > 1 or not name else name
+        for name, file in zip(described, files, strict=True)
+    ]
+
+
+def _described(file: ResultFile) -> str:
+    if file.is_initial:
+        return UNREFINED
+    settings = file.sidecar.get("settings")
+    inner = settings.get("loss") if isinstance(settings, dict) else None
+    method, loss = file.sidecar.get("method"), file.sidecar.get("loss", inner)
+    parts = [method if isinstance(method, str) else "", f"{loss} loss" if isinstance(loss, str) and loss else ""]
+    return ", ".join(part for part in parts if part)

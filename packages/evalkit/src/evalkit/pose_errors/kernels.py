@@ -54,7 +54,7 @@ def max_distance(T_est, T_gt, points_m, symmetries):
 @compiled
 @no_type_check
 def projected_distances(T_est, T_gt, K, points_m, symmetries):
-    """Of projected points, pixels, (b, 3): largest distance at the best symmetry, average without, average at the best.
+    """Distances of projected points, pixels, (b, 3): largest at the best symmetry, mean without, mean at the best.
 
     Infinite where a point lies in the camera's plane. K is (b, 3, 3).
     """
@@ -68,10 +68,10 @@ def projected_distances(T_est, T_gt, K, points_m, symmetries):
             w = P[2, 0] * x + P[2, 1] * y + P[2, 2] * z + P[2, 3]
             estimated[k, 0] = (P[0, 0] * x + P[0, 1] * y + P[0, 2] * z + P[0, 3]) / w
             estimated[k, 1] = (P[1, 0] * x + P[1, 1] * y + P[1, 2] * z + P[1, 3]) / w
-        own = symmetries[i % len(symmetries)]
+        transforms = symmetries[i % len(symmetries)]
         best_largest, best_total = np.inf, np.inf
-        for s in range(len(own)):
-            P = K[i] @ (T_gt[i] @ own[s])[:3]
+        for s in range(len(transforms)):
+            P = K[i] @ (T_gt[i] @ transforms[s])[:3]
             largest, total = 0.0, 0.0
             for k in range(count):
                 x, y, z = points_m[k, 0], points_m[k, 1], points_m[k, 2]
@@ -95,9 +95,9 @@ def projected_distances(T_est, T_gt, K, points_m, symmetries):
 @compiled
 @no_type_check
 def nearest_points(query_m, points_m, first, neighbours):
-    """Index of the point nearest to each query, (n,), along a Delaunay graph: see `nearest.NearestPoints`.
+    """Index of the point nearest to each query, (n,), along a Delaunay graph, see `nearest_points.NearestPoints`.
 
-    The walk starts where the query before ended: a point none of whose neighbours is nearer is the nearest of all.
+    The walk starts at the previous query's result: a point without a nearer neighbour is the nearest of all points.
     """
     result = np.empty(len(query_m), np.int64)
     here = 0

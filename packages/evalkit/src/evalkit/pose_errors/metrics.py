@@ -18,8 +18,12 @@ Poses = Float[Array, "*b 4 4"]
 Errors = Float[Array, "*b"]
 Points = Float[Array, "n 3"]
 Symmetries = Float[Array, "*g s 4 4"]
+VSD_TAUS = np.arange(0.05, 0.51, 0.05)
+"""Tolerances of BOP19's VSD, diameters."""
+VSD_COLUMNS = tuple(f"vsd_{tau:.2f}" for tau in VSD_TAUS)
+"""Columns of the error table with VSD at these tolerances."""
 BOP_RAY_PX = 0.0
-"""Where in a pixel bop_toolkit's rays go through when it turns depth into distance."""
+"""Offset within a pixel of bop_toolkit's rays from depth to distance: its corner."""
 
 
 def add(T_est: Poses, T_gt: Poses, points_m: Points) -> Errors:
@@ -28,9 +32,9 @@ def add(T_est: Poses, T_gt: Poses, points_m: Points) -> Errors:
 
 
 def adi(T_est: Poses, T_gt: Poses, points: Points | NearestPoints) -> Errors:
-    """Average distance from each true model point to the nearest estimated one (ADI, also ADD-S), metres.
+    """Average distance from each ground-truth model point to the nearest estimated one (ADI, also ADD-S), metres.
 
-    `NearestPoints` instead of the vertices keeps what the search makes of them.
+    `NearestPoints` instead of the vertices reuses its search structure.
     """
     nearest = points if isinstance(points, NearestPoints) else NearestPoints(points)
     return _per_pose(nearest.mean_distance_m(_flat(T_est), _flat(T_gt)), T_est)
@@ -41,8 +45,8 @@ def mssd(T_est: Poses, T_gt: Poses, points_m: Points, symmetries: Symmetries) ->
 
     The largest distance under an affine map is at a vertex of the convex hull: the hull's vertices give the same value.
     """
-    turns = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
-    return _per_pose(kernels.max_distance(_flat(T_est), _flat(T_gt), _packed(points_m), turns), T_est)
+    transforms = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
+    return _per_pose(kernels.max_distance(_flat(T_est), _flat(T_gt), _packed(points_m), transforms), T_est)
 
 
 def mspd(T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points, symmetries: Symmetries) -> Errors:
@@ -62,15 +66,15 @@ def projection_errors(
 
     They are infinite where a point lies in the camera's plane; points behind it are mirrored, as in bop_toolkit.
     """
-    turns = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
+    transforms = _packed(symmetries).reshape(-1, *symmetries.shape[-3:])
     K_of_each = np.ascontiguousarray(np.broadcast_to(_flat(K), (len(_flat(T_est)), 3, 3)))
-    errors = kernels.projected_distances(_flat(T_est), _flat(T_gt), K_of_each, _packed(points_m), turns)
+    errors = kernels.projected_distances(_flat(T_est), _flat(T_gt), K_of_each, _packed(points_m), transforms)
     largest, average, average_best = (_per_pose(values, T_est) for values in errors.T)
     return largest, average, average_best
 
 
 def _packed(values: Float[Array, "*s"]) -> Float[Array, "*s"]:
-    """In the layout and precision the compiled loops take."""
+    """Contiguous float64, as the compiled loops take it."""
     return np.ascontiguousarray(values, np.float64)
 
 
@@ -88,7 +92,7 @@ def re(T_est: Poses, T_gt: Poses) -> Errors:
 
 
 def _angle_rad(R_est: Float[Array, "*a 3 3"], R_gt: Float[Array, "*b 3 3"]) -> Float[Array, "*c"]:
-    """Angle of R_est R_gt^-1, exactly 0 where both are the same: only what differs from the identity is computed."""
+    """Angle of R_est R_gt^-1, exactly 0 where both are equal: only the difference from the identity is computed."""
     D = (R_est - R_gt) @ _inverse(R_gt)
     skew = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
     cosine = 1.0 + np.trace(D, axis1=-2, axis2=-1) / 2.0
@@ -96,7 +100,7 @@ def _angle_rad(R_est: Float[Array, "*a 3 3"], R_gt: Float[Array, "*b 3 3"]) -> F
 
 
 def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """The true inverse, by cross products of rows: annotations are not exactly orthonormal, so no transpose."""
+    """The exact inverse, by cross products of rows: annotations are not exactly orthonormal, so no transpose."""
     columns = [np.cross(R[..., (i + 1) % 3, :], R[..., (i + 2) % 3, :]) for i in range(3)]
     determinant = np.sum(R[..., 0, :] * columns[0], axis=-1)
     return np.asarray(np.stack(columns, axis=-1) / determinant[..., None, None])
@@ -104,8 +108,8 @@ def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
 
 def re_symmetric(T_est: Poses, T_gt: Poses, symmetries: Symmetries) -> Errors:
     """The same angle at the best symmetry, radians."""
-    true = T_gt[..., None, :3, :3] @ symmetries[..., :3, :3]
-    return np.asarray(_angle_rad(T_est[..., None, :3, :3], true).min(axis=-1))
+    R_gt = T_gt[..., None, :3, :3] @ symmetries[..., :3, :3]
+    return np.asarray(_angle_rad(T_est[..., None, :3, :3], R_gt).min(axis=-1))
 
 
 def te(T_est: Poses, T_gt: Poses) -> Errors:
@@ -114,7 +118,7 @@ def te(T_est: Poses, T_gt: Poses) -> Errors:
 
 
 def te_axes(T_est: Poses, T_gt: Poses) -> Float[Array, "*b 3"]:
-    """Estimated minus true origin along the camera's x (right), y (down) and z (forward), metres, signed."""
+    """Estimated minus ground-truth origin along the camera's x (right), y (down) and z (forward), metres, signed."""
     return np.asarray(T_est[..., :3, 3] - T_gt[..., :3, 3])
 
 
@@ -139,14 +143,14 @@ def visible_masks(
     distance_scene_m: Float[Array, "*b h w"],
     delta_m: float = 0.015,
 ) -> tuple[Bool[Array, "*b h w"], Bool[Array, "*b h w"]]:
-    """Visible parts of an estimated and a true render before a measured scene (BOP19's rules).
+    """Visible parts of an estimated and a ground-truth render in a measured scene (BOP19's rules).
 
-    A rendered pixel is visible where nothing was measured, or what was measured is not nearer by more than `delta_m`.
-    The estimate is also visible where the truth is and both are rendered.
+    A rendered pixel is visible where depth is unknown, or the scene is not nearer by more than `delta_m`. The estimate
+    is also visible where the ground truth is and both are rendered.
 
     Args:
         distance_est_m: distance from the camera's centre (not z), 0 where not hit.
-        distance_gt_m: the same for the true pose.
+        distance_gt_m: the same for the ground-truth pose.
         distance_scene_m: the same as measured, 0 where unknown.
         delta_m: tolerance, metres.
     """
@@ -165,22 +169,22 @@ def vsd(
 ) -> Float[Array, "*b t"]:
     """Visible surface discrepancy (VSD), 0 to 1, for every tolerance; 1 where neither pose is visible.
 
-    Of the pixels where either render is visible, the share where only one is, or where both are and their distances
-    differ by a tolerance or more ("step" cost). Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation", ECCV
-    2018, with the visibility of BOP19 (`visible_masks`).
+    The fraction, among pixels where either render is visible, where only one is visible, or where both are and their
+    distances differ by a tolerance or more ("step" cost). Hodan et al., "BOP: Benchmark for 6D Object Pose Estimation",
+    ECCV 2018, with the visibility of BOP19 (`visible_masks`).
 
     Args:
         distance_est_m: distance from the camera's centre (not z), 0 where not hit.
-        distance_gt_m: the same for the true pose.
+        distance_gt_m: the same for the ground-truth pose.
         distance_scene_m: the same as measured, 0 where unknown.
         taus_m: tolerances, metres; BOP19 takes 0.05, 0.10, ... 0.50 diameters.
         delta_m: tolerance of visibility, metres.
     """
     visible_est, visible_gt = visible_masks(distance_est_m, distance_gt_m, distance_scene_m, delta_m)
     both = visible_est & visible_gt
-    apart = np.abs(distance_gt_m - distance_est_m)
+    differences_m = np.abs(distance_gt_m - distance_est_m)
     union = np.count_nonzero(visible_est | visible_gt, axis=(-2, -1))
-    agree = np.stack([np.count_nonzero(both & (apart < tau), axis=(-2, -1)) for tau in taus_m], axis=-1)
+    agree = np.stack([np.count_nonzero(both & (differences_m < tau), axis=(-2, -1)) for tau in taus_m], axis=-1)
     return np.where(union[..., None] > 0, 1.0 - agree / np.maximum(union, 1)[..., None], 1.0)
 
 

@@ -1,4 +1,4 @@
-"""The errors of many poses of one object at once, as columns."""
+"""Errors of many poses of an object at once, as columns."""
 
 from dataclasses import dataclass, field
 
@@ -22,7 +22,7 @@ ERRORS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A mesh that errors are measured on, with what is made of it once."""
+    """A mesh for pose errors, with its convex hull, symmetries and neighbour search."""
 
     mesh: Mesh
     info: ModelInfo
@@ -39,11 +39,11 @@ class Model:
     def symmetries_of(
         self, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"]
     ) -> Float[Array, "s 4 4"] | Float[Array, "b 2 4 4"]:
-        """The object's symmetries; a ball's are the identity and, for each pair, the one that aligns it exactly."""
+        """The object's symmetries; a ball's are the identity and each pair's exactly aligning rotation."""
         continuous = self.info.symmetries_continuous
         if not is_ball(continuous):
             return self.symmetries
-        aligned = [align_ball(continuous, truth, estimate) for estimate, truth in zip(T_est, T_gt, strict=True)]
+        aligned = [align_ball(continuous, gt, estimate) for estimate, gt in zip(T_est, T_gt, strict=True)]
         return np.asarray(np.stack([np.broadcast_to(np.eye(4), T_est.shape), np.array(aligned)], axis=1))
 
 
@@ -55,7 +55,7 @@ def pose_errors(
     Args:
         model: of the object.
         T_est: estimates `T_cam_obj`, metres.
-        T_gt: true poses.
+        T_gt: ground-truth poses.
         K: intrinsics of their images, pixels.
     """
     points_m, symmetries = np.asarray(model.mesh.vertices_m, np.float64), model.symmetries_of(T_est, T_gt)

@@ -1,4 +1,4 @@
-"""Rendered silhouettes, kept as small patches of the image."""
+"""Rendered silhouettes, stored as small patches of the image."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from evalkit.pose_errors import metrics
 
 Array = np.ndarray
 TILE_SIDES_PX = (64, 128, 192, 256, 384, 512, 1024)
-"""Sides that tiles are rounded up to, as the renderer keeps a few sizes at hand."""
+"""Tile sides: the renderer keeps buffers of a few sizes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Patch:
-    """The part of an image where an object was rendered; 0 outside of it.
+    """The part of an image with a rendered object; depth is 0 outside.
 
     Attributes:
         depth_m: (h, w) camera z, 0 where not hit.
@@ -33,15 +33,15 @@ class Patch:
 def render_patch(
     rasteriser: Rasteriser, obj_id: int, outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]
 ) -> Patch:
-    """Render one pose; only what lies inside the image is kept.
+    """Render one pose, cropped to the image.
 
     Pixels are those of a full-frame render: the crop moves the principal point by whole pixels. Poses are rendered one
-    at a time, as side by side in one framebuffer a pixel on an edge may depend on the place in it.
+    at a time: side by side in one framebuffer, a pixel on an edge may depend on its position there.
 
     Args:
         rasteriser: has the object's mesh.
         obj_id: which mesh.
-        outline_m: points that the mesh lies between: its vertices, or those of its convex hull, which are fewer.
+        outline_m: vertices of the mesh, or the fewer ones of its convex hull.
         camera: of the image.
         T_cam_obj: pose, metres.
     """
@@ -55,7 +55,7 @@ def render_patch(
 
 
 def _tile(outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]) -> tuple[int, int, int]:
-    """Left, top and side of a square that covers the object's part of the image; side 0 where there is none."""
+    """Left, top and side of a square over the object's part of the image; side 0 for an object outside."""
     width, height = camera.width_px, camera.height_px
     left, top, right, bottom = silhouette_box(outline_m, camera.K, T_cam_obj)
     x0, y0 = int(max(np.floor(left) - 1, 0)) if left > 0 else 0, int(max(np.floor(top) - 1, 0)) if top > 0 else 0
@@ -76,38 +76,38 @@ def _trim(depth_m: Float[Array, "s s"], x0_px: int, y0_px: int, camera: Camera) 
     return Patch(depth_m=kept, x0_px=x0_px + int(columns[0]), y0_px=y0_px + int(rows[0]))
 
 
-def vss_full(estimated: Patch, true: Patch) -> float:
+def vss_full(estimated: Patch, gt: Patch) -> float:
     """VSS of the two whole silhouettes."""
-    first, second, _, _ = _on_common_canvas(estimated, true)
+    first, second, _, _ = _on_common_canvas(estimated, gt)
     return metrics.vss(first > 0, second > 0)
 
 
 def vss_visible(
-    estimated: Patch, true: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"], delta_m: float = 0.015
+    estimated: Patch, gt: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"], delta_m: float = 0.015
 ) -> float:
     """VSS of the visible parts, by measured depth: 1 - VSD with tau = infinity."""
-    distances = _distances(estimated, true, K, depth_scene_m)
+    distances = _distances(estimated, gt, K, depth_scene_m)
     return metrics.vss(*metrics.visible_masks(distances[0], distances[1], distances[2], delta_m))
 
 
 def vsd(
     estimated: Patch,
-    true: Patch,
+    gt: Patch,
     K: Float[Array, "3 3"],
     depth_scene_m: Float[Array, "h w"],
     taus_m: Float[Array, " t"],
     delta_m: float = 0.015,
 ) -> Float[Array, " t"]:
     """VSD for every tolerance from one pair of renders, see `metrics.vsd`."""
-    distances = _distances(estimated, true, K, depth_scene_m)
+    distances = _distances(estimated, gt, K, depth_scene_m)
     return metrics.vsd(distances[0], distances[1], distances[2], taus_m, delta_m)
 
 
 def _distances(
-    estimated: Patch, true: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"]
+    estimated: Patch, gt: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"]
 ) -> list[Float[Array, "rows columns"]]:
-    """Distances of the estimate, the truth and the scene where either was rendered, along bop_toolkit's rays."""
-    first, second, x0, y0 = _on_common_canvas(estimated, true)
+    """Distances of estimate, ground truth and scene where either was rendered, along bop_toolkit's rays."""
+    first, second, x0, y0 = _on_common_canvas(estimated, gt)
     rows, columns = first.shape
     scene = depth_scene_m[y0 : y0 + rows, x0 : x0 + columns]
     return [metrics.distance_from_depth(K, part, x0, y0, metrics.BOP_RAY_PX) for part in (first, second, scene)]

@@ -1,1 +1,1 @@
-"""The HTML report: what it says, its plots, pictures and page."""
+"""The HTML report: summary, plots, pictures and page."""

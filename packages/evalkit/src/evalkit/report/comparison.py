@@ -1,4 +1,4 @@
-"""What changed between two result files, pose by pose: numbers with intervals, and the same in words."""
+"""Change between two result files, pose by pose: numbers with intervals, and the same in words."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,11 +21,11 @@ COMPARED: Mapping[str, str] = {
     "tz_mm": "z error",
     "add_mm": "ADD",
 }
-"""Errors whose medians are compared, and what they are called."""
-SHARES: Mapping[str, str] = {"vss_mean": "mean VSS", "add_s_recall": "ADD(-S) recall at 0.1 diameter"}
+"""Errors whose medians are compared, and their names."""
+FRACTIONS: Mapping[str, str] = {"vss_mean": "mean VSS", "add_s_recall": "ADD(-S) recall at 0.1 diameter"}
 """Scores whose means are compared."""
 NO_ERROR = 1e-4
-"""Degrees and millimetres: a result file's nine decimals lie below."""
+"""Degrees and millimetres, above the rounding of a result file's nine decimals."""
 MINUS = "\N{MINUS SIGN}"
 
 
@@ -36,17 +36,17 @@ def compare(reference: Scored, other: Scored, *, resamples: int = 1000, seed: in
     drawn together.
 
     Args:
-        reference: start poses, or the file that the other is compared with.
-        other: the file that is spoken of.
+        reference: initial poses, or another file.
+        other: file compared with the reference.
         resamples: of the bootstrap.
         seed: of the bootstrap.
 
     Returns:
-        `name`, `start` (name of the reference), `is_start`, `poses` (found in both), `missing` (in the other file),
-        `medians` by error with `poses`, `start`, `refined`, `ratio`, `difference`, `interval`; `vss_mean` and
-        `add_s_recall` with the same but for the ratio; `resampled` (units in words); `headline`, `verdict` (what
-        got better, worse, or did not change significantly; empty without intervals), `changes`, a phrase for each
-        number, and `words`, all of it in one text. Values without data are NaN.
+        `name`, `reference` (its name), `is_initial` (of the reference), `poses` (found in both), `missing` (in the
+        other file), `medians` by error with `poses`, `reference`, `refined`, `ratio`, `difference`, `interval`;
+        `vss_mean` and `add_s_recall` with the same but for the ratio; `resampled` (units in words); `headline`;
+        `verdict` (scores that are better, worse, or without significant change; empty without intervals); `changes`, a
+        phrase for each number; and `words`, the whole text. Values without data are NaN.
     """
     reference_cases, other_cases = reference.cases(), other.cases()
     rows = np.array([(reference_cases[key], row) for key, row in other_cases.items() if key in reference_cases])
@@ -58,13 +58,13 @@ def compare(reference: Scored, other: Scored, *, resamples: int = 1000, seed: in
     old, new = found_errors(before), found_errors(after)
     compared: dict[str, Any] = {
         "name": other.file.name,
-        "start": reference.file.name,
-        "is_start": reference.file.is_start,
+        "reference": reference.file.name,
+        "is_initial": reference.file.is_initial,
         "poses": len(after),
         "missing": int((~other.table.found).sum()),
         "medians": {name: _medians(old[name], new[name], drawn) for name in COMPARED},
         "vss_mean": _means(column(before, "vss"), column(after, "vss"), drawn),
-        "add_s_recall": _means(_shares(solved(all_before)), _shares(solved(all_after)), all_drawn),
+        "add_s_recall": _means(_fractions(solved(all_before)), _fractions(solved(all_after)), all_drawn),
         "resampled": drawn.units.text,
     }
     compared["headline"] = _headline(compared)
@@ -74,78 +74,80 @@ def compare(reference: Scored, other: Scored, *, resamples: int = 1000, seed: in
     return compared
 
 
-def _shares(flags: Bool[Array, " n"]) -> Float[Array, " n"]:
+def _fractions(flags: Bool[Array, " n"]) -> Float[Array, " n"]:
     return flags.astype(np.float64)
 
 
 def _medians(old: Float[Array, " n"], new: Float[Array, " n"], drawn: Resampling) -> Change:
-    """Medians over the poses whose start has an error of this kind: curves also hold starts that are only moved."""
+    """Medians over poses with an initial error of this kind, which initial poses that are only translated have not."""
     off = old > NO_ERROR
     if not off.any():
         nothing = float("nan")
-        return {"poses": 0, "start": nothing, "refined": nothing, "ratio": nothing, "difference": nothing} | {
+        return {"poses": 0, "reference": nothing, "refined": nothing, "ratio": nothing, "difference": nothing} | {
             "interval": None
         }
     old, new = np.where(off, old, np.nan), np.where(off, new, np.nan)
-    start, refined = float(np.nanmedian(old)), float(np.nanmedian(new))
+    before, after = float(np.nanmedian(old)), float(np.nanmedian(new))
     interval = drawn.ends(drawn.medians(new) - drawn.medians(old), drawn.units_with(old))
-    counts = {"poses": int(off.sum()), "start": start, "refined": refined, "ratio": refined / start}
-    return counts | {"difference": refined - start, "interval": interval}
+    counts = {"poses": int(off.sum()), "reference": before, "refined": after, "ratio": after / before}
+    return counts | {"difference": after - before, "interval": interval}
 
 
 def _means(old: Float[Array, " n"], new: Float[Array, " n"], drawn: Resampling) -> Change:
     if not len(old):
         nothing = float("nan")
-        return {"start": nothing, "refined": nothing, "difference": nothing, "interval": None}
-    start, refined = float(old.mean()), float(new.mean())
+        return {"reference": nothing, "refined": nothing, "difference": nothing, "interval": None}
+    before, after = float(old.mean()), float(new.mean())
     interval = drawn.ends(drawn.means((new - old)[None])[0], drawn.units.count)
-    return {"start": start, "refined": refined, "difference": refined - start, "interval": interval}
+    return {"reference": before, "refined": after, "difference": after - before, "interval": interval}
 
 
 def _headline(compared: Change) -> str:
-    name, reference, count = compared["name"], compared["start"], compared["poses"]
+    name, reference, count = compared["name"], compared["reference"], compared["poses"]
     if not count:
         return f"{name} and {reference} have no pose in common."
-    against = f"its start poses ({reference})" if compared["is_start"] else reference
+    against = f"its initial poses ({reference})" if compared["is_initial"] else reference
     poses = "the pose" if count == 1 else f"the {count} poses"
     return f"{name} against {against}, medians over {poses} found in both"
 
 
 def _verdict(compared: Change) -> str:
-    """Which numbers are better, worse or neither, by their intervals."""
-    found: dict[str, list[str]] = {"better": [], "worse": [], "no significant change": []}
+    """Scores that are better, worse or neither, by their intervals."""
+    labels_by_verdict: dict[str, list[str]] = {"better": [], "worse": [], "no significant change": []}
     errors = [(label, compared["medians"][key]["interval"], -1) for key, label in COMPARED.items()]
-    scores = [(label, compared[key]["interval"], 1) for key, label in SHARES.items()]
+    scores = [(label, compared[key]["interval"], 1) for key, label in FRACTIONS.items()]
     for label, interval, sign in (*errors, *scores):
         if interval is not None:
             better = (interval[0] > 0.0) if sign > 0 else (interval[1] < 0.0)
-            found["no significant change" if holds_zero(interval) else "better" if better else "worse"].append(label)
-    parts = [f"{name}: {', '.join(labels)}." for name, labels in found.items() if labels]
+            labels_by_verdict[
+                "no significant change" if contains_zero(interval) else "better" if better else "worse"
+            ].append(label)
+    parts = [f"{name}: {', '.join(labels)}." for name, labels in labels_by_verdict.items() if labels]
     return " ".join(part[0].upper() + part[1:] for part in parts)
 
 
 def _changes(compared: Change) -> list[str]:
-    whose = "the start's" if compared["is_start"] else f"that of {compared['start']}"
-    said = []
+    whose = "the initial one" if compared["is_initial"] else f"that of {compared['reference']}"
+    phrases = []
     for key, label in COMPARED.items():
         values = compared["medians"][key]
         if not values["poses"]:
             continue
         unit = "°" if key.endswith("_deg") else " mm"
-        few = f", {values['poses']} starts" if values["poses"] < compared["poses"] else ""
-        numbers = f"{values['start']:.3g}{unit} to {values['refined']:.3g}{unit}{few}{_difference(values, unit)}"
-        said.append(f"{label} {_relative(values, whose)} ({numbers})")
+        few = f", {values['poses']} poses" if values["poses"] < compared["poses"] else ""
+        numbers = f"{values['reference']:.3g}{unit} to {values['refined']:.3g}{unit}{few}{_difference(values, unit)}"
+        phrases.append(f"{label} {_relative(values, whose)} ({numbers})")
     for key, factor, unit, style in (("vss_mean", 1.0, "", ".3f"), ("add_s_recall", 100.0, " %", ".1f")):
         values = compared[key]
-        start, refined = (format(factor * values[side], style) for side in ("start", "refined"))
+        before, after = (format(factor * values[side], style) for side in ("reference", "refined"))
         change = _difference(values, unit and " points", factor, style)
-        verdict = "no significant change, " if holds_zero(values["interval"]) else ""
-        said.append(f"{SHARES[key]} {verdict}{start}{unit} to {refined}{unit}{change}")
-    return said
+        verdict = "no significant change, " if contains_zero(values["interval"]) else ""
+        phrases.append(f"{FRACTIONS[key]} {verdict}{before}{unit} to {after}{unit}{change}")
+    return phrases
 
 
 def _relative(values: Change, whose: str) -> str:
-    if holds_zero(values["interval"]):
+    if contains_zero(values["interval"]):
         return "no significant change"
     ratio = values["ratio"]
     if values["interval"] is None and abs(ratio - 1.0) < 0.02:
@@ -153,8 +155,8 @@ def _relative(values: Change, whose: str) -> str:
     return f"{'down to' if ratio < 1 else 'up to'} {ratio:.2f} of {whose}"
 
 
-def holds_zero(interval: Interval) -> bool:
-    """Whether a change may be none at all. Without an interval nothing is said."""
+def contains_zero(interval: Interval) -> bool:
+    """Whether an interval of a change contains zero; False without an interval."""
     return interval is not None and interval[0] <= 0.0 <= interval[1]
 
 
@@ -174,7 +176,7 @@ def _style(largest: float) -> str:
 
 
 def signed(number: float, style: str) -> str:
-    """A number with its sign, which zero has not."""
+    """A number with its sign; zero without."""
     text = format(abs(number), style)
     if not float(text):
         return text
@@ -187,12 +189,12 @@ def _words(compared: Change) -> str:
     name, missing = compared["name"], compared["missing"]
     are = "pose is" if missing == 1 else "poses are"
     lost = f" {missing} {are} missing in {name}: failures in the tables." if missing else ""
-    said = f"{compared['headline']}: {'; '.join(compared['changes'])}.{lost} {interval_words(compared)}"
-    return f"{said} {compared['verdict']}".strip()
+    phrases = f"{compared['headline']}: {'; '.join(compared['changes'])}.{lost} {interval_words(compared)}"
+    return f"{phrases} {compared['verdict']}".strip()
 
 
 def interval_words(compared: Mapping[str, Any]) -> str:
-    """What the intervals were drawn from, or why there are none."""
+    """The resampled units of the intervals, or the reason for none."""
     if compared["vss_mean"]["interval"] is None:
         return f"No intervals: {compared['resampled']} only, so this may be chance."
     return f"Intervals of 95 %, from resampling {compared['resampled']}."

@@ -1,4 +1,4 @@
-"""Pictures of single poses: the image around the object, with the contours of truth and estimate."""
+"""Pictures of single poses: the image around the object, with the contours of ground truth and estimate."""
 
 import base64
 from collections.abc import Sequence
@@ -14,28 +14,28 @@ from evalkit.evaluation.evaluator import Evaluator
 
 Array = np.ndarray
 SIDE_PX = 300
-TRUTH_RGB = (0, 224, 110)
+GT_RGB = (0, 224, 110)
 ESTIMATE_RGB = (255, 64, 160)
 DASH_PX, GAP_PX = 9, 6
-"""Colours alone are not told apart by everyone, so the estimate's contour is dashed."""
+"""The estimate's contour is dashed, for readers who do not distinguish the colours."""
 MARGIN = 1.35
-LARGEST_OVER_TRUTH = 3.0
-"""An estimate far away does not shrink the object to a dot: it may leave the picture instead."""
+LARGEST_OVER_GT = 3.0
+"""Largest side over the ground truth's: a distant estimate may leave the picture, the object stays visible."""
 
 
 def common_window(
     evaluator: Evaluator, obj_id: int, camera: Camera, T_gt: Float[Array, "4 4"], poses: Sequence[Float[Array, "4 4"]]
 ) -> Window:
-    """A square that shows the truth and, as far as possible, all estimates."""
+    """A square around the ground truth and, as far as possible, all estimates."""
     vertices = evaluator.mesh(obj_id).vertices_m
     boxes = [silhouette_box(vertices, camera.K, T_cam_obj) for T_cam_obj in (T_gt, *poses)]
-    true = boxes[0] if np.isfinite(boxes[0]).all() else np.array([0.0, 0.0, camera.width_px, camera.height_px])
-    near = np.stack([true, *[box for box in boxes[1:] if np.isfinite(box).all()]])
+    box_gt = boxes[0] if np.isfinite(boxes[0]).all() else np.array([0.0, 0.0, camera.width_px, camera.height_px])
+    near = np.stack([box_gt, *[box for box in boxes[1:] if np.isfinite(box).all()]])
     low, high = near[:, :2].min(axis=0), near[:, 2:].max(axis=0)
-    true_side = float((true[2:] - true[:2]).max())
-    side = max(float((high - low).max()), true_side, 16.0)
-    limit = LARGEST_OVER_TRUTH * max(true_side, 16.0)
-    center = (low + high) / 2 if side <= limit else (true[:2] + true[2:]) / 2
+    gt_side = float((box_gt[2:] - box_gt[:2]).max())
+    side = max(float((high - low).max()), gt_side, 16.0)
+    limit = LARGEST_OVER_GT * max(gt_side, 16.0)
+    center = (low + high) / 2 if side <= limit else (box_gt[:2] + box_gt[2:]) / 2
     side = min(side, limit) * MARGIN
     return Window(x0_px=float(center[0] - side / 2), y0_px=float(center[1] - side / 2), side_px=side)
 
@@ -49,14 +49,13 @@ def overlay(
     T_gt: Float[Array, "4 4"],
     T_est: Float[Array, "4 4"] | None,
 ) -> UInt8[Array, "s s 3"]:
-    """The image in a window, with the true contour in green and over it the estimated one, dashed and pink."""
+    """The image in a window, with the ground-truth contour in green and the estimated one above, dashed and pink."""
     shrinks = window.side_px > SIDE_PX
     patch = np.ascontiguousarray(cut(rgb, window, SIDE_PX, interpolation="area" if shrinks else "linear", fill=235))
     poses = [T_gt] if T_est is None else [T_gt, T_est]
     K = crop_K(camera.K, window, SIDE_PX)
     masks = evaluator.rasteriser.render(obj_id, K, np.stack(poses), SIDE_PX, SIDE_PX, rgb=False).mask
-    true = _outlines(masks[0])
-    _draw(patch, true, True, TRUTH_RGB)
+    _draw(patch, _outlines(masks[0]), True, GT_RGB)
     if T_est is not None:
         dashes = [dash for outline in _outlines(masks[1]) for dash in _dashes(outline)]
         _draw(patch, dashes, False, ESTIMATE_RGB)
@@ -68,7 +67,7 @@ def _outlines(mask: Bool[Array, "s s"]) -> Sequence[Array]:
 
 
 def _dashes(outline: Array) -> list[Array]:
-    """Pieces of a closed outline that holds every pixel, as many as fit with equal gaps."""
+    """Pieces of a closed outline of adjacent pixels, as many as fit with equal gaps."""
     count = max(1, round(len(outline) / (DASH_PX + GAP_PX)))
     starts = np.linspace(0, len(outline), count, endpoint=False).astype(int)
     length = max(2, len(outline) * DASH_PX // (count * (DASH_PX + GAP_PX)))

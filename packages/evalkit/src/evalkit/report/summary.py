@@ -1,4 +1,4 @@
-"""What a report says: scores of every result file, and how each compares with the start poses. Plain data."""
+"""A report as plain data: scores of every result file, and their change from the initial poses."""
 
 import platform
 from collections.abc import Mapping, Sequence
@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
-from posecore.bop import BopDataset, symmetry_transforms
+from posecore.bop import BopDataset, ModelInfo
 from posecore.files import sha256_bytes, sha256_file
 
 from evalkit import __version__
@@ -30,11 +29,9 @@ VSS_DEFINITIONS = {
 
 def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> dict[str, Any]:
     """The whole report as JSON-ready data; values without data are None."""
-    starts = [item for item in scored if item.file.is_start]
+    initial = [item for item in scored if item.file.is_initial]
     distances_m = [column(item.table, "distance_m") for item in scored]
     distance_edges_m = bins.round_edges(np.concatenate(distances_m) if distances_m else np.zeros(0))
-    obj_ids = sorted({int(obj_id) for item in scored for obj_id in item.table.obj_id.unique()})
-    symmetries = {obj_id: symmetry_transforms(dataset.models_info[obj_id]) for obj_id in obj_ids}
     summary = {
         "dataset": {
             "name": dataset.name,
@@ -46,23 +43,23 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
         "vss": vss,
         "definitions": dict(DEFINITIONS) | {"VSS variant": VSS_DEFINITIONS[vss]},
         "versions": versions(),
-        "files": [_file_summary(item, distance_edges_m, symmetries) for item in scored],
-        "against_start": [compare(start_of(item, starts), item) for item in scored if starts and item is not starts[0]],
-        "against_first": [] if starts else [compare(scored[0], item) for item in scored[1:]],
+        "files": [_file_summary(item, distance_edges_m, dataset.models_info) for item in scored],
+        "against_initial": [
+            compare(initial_of(item, initial), item) for item in scored if initial and item is not initial[0]
+        ],
+        "against_first": [] if initial else [compare(scored[0], item) for item in scored[1:]],
     }
     cleaned: dict[str, Any] = _without_nan(summary)
     return cleaned
 
 
-def _file_summary(
-    item: Scored, distance_edges_m: Sequence[float], symmetries: Mapping[int, Float[Array, "_ 4 4"]]
-) -> dict[str, Any]:
+def _file_summary(item: Scored, distance_edges_m: Sequence[float], infos: Mapping[int, ModelInfo]) -> dict[str, Any]:
     sidecar = {key: value for key, value in item.file.sidecar.items() if key not in ("perturbation", "initial_lines")}
     return {
         "name": item.file.name,
         "path": str(item.file.path),
         "sha256": item.file.sha256,
-        "is_start": item.file.is_start,
+        "is_initial": item.file.is_initial,
         "sidecar": sidecar,
         "ignored_lines": item.ignored,
         "total": scores(item.table) | {name: value for name, value in item.precision.items() if name != "by_object"},
@@ -72,7 +69,7 @@ def _file_summary(
         },
         "by_level": by_level(item.table),
         "bins": bins_of(item.table, distance_edges_m),
-        "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, symmetries)).to_dict("index"),
+        "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, infos)).to_dict("index"),
         "intervals": {
             "total": score_intervals(item.table).as_json(),
             "by_object": {
@@ -82,10 +79,10 @@ def _file_summary(
     }
 
 
-def start_of(item: Scored, starts: Sequence[Scored]) -> Scored:
-    """The start poses that a file came from: those that its sidecar names as `init`, else the first."""
-    named = [start for start in starts if start.file.path.name == item.file.sidecar.get("init")]
-    return [*named, *starts][0]
+def initial_of(item: Scored, initial: Sequence[Scored]) -> Scored:
+    """The initial poses of a file: those that its sidecar names as `init`, else the first."""
+    named = [other for other in initial if other.file.path.name == item.file.sidecar.get("init")]
+    return [*named, *initial][0]
 
 
 def worst_cases(scored: Sequence[Scored], count: int) -> list[CaseKey]:
@@ -94,8 +91,8 @@ def worst_cases(scored: Sequence[Scored], count: int) -> list[CaseKey]:
         return []
     table = scored[-1].table
     vss, angle = column(table, "vss"), column(table, "re_sym_rad")
-    found = [(key, row) for key, row in scored[-1].cases().items() if table.found.iloc[row]]
-    ordered = sorted(found, key=lambda item: (vss[item[1]], -angle[item[1]]))
+    cases = [(key, row) for key, row in scored[-1].cases().items() if table.found.iloc[row]]
+    ordered = sorted(cases, key=lambda item: (vss[item[1]], -angle[item[1]]))
     return [key for key, _ in ordered[:count]]
 
 
@@ -108,11 +105,11 @@ def bins_of(table: pd.DataFrame, distance_edges_m: Sequence[float]) -> dict[str,
         "elevation": bins.by_elevation(table),
         "viewpoint": bins.by_viewpoint(table, scores=("vss_mean",), resamples=0),
     }
-    return {name: found.to_dict("records") for name, found in tables.items()}
+    return {name: binned.to_dict("records") for name, binned in tables.items()}
 
 
 def dataset_sha256(dataset: BopDataset) -> str:
-    """One hash over what errors depend on: targets, ground truth, cameras, models and their infos."""
+    """One hash over the inputs of errors: targets, ground truth, cameras, models and their infos."""
     files = [dataset.root / f"{dataset.split}_targets_{edition}.json" for edition in ("bop19", "bop24")]
     files += [dataset.root / folder / "models_info.json" for folder in ("models", "models_eval")]
     files += [dataset.mesh_path(obj_id, eval=True) for obj_id in sorted({target.obj_id for target in dataset.targets})]
@@ -123,14 +120,14 @@ def dataset_sha256(dataset: BopDataset) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computed the numbers."""
-    found = {"evalkit": __version__, "python": platform.python_version()}
+    """Versions of the software."""
+    by_package = {"evalkit": __version__, "python": platform.python_version()}
     for name in ("posecore", "numpy", "scipy", "opencv-python-headless", "moderngl"):
         try:
-            found[name] = metadata.version(name)
+            by_package[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    return by_package
 
 
 def _without_nan(value: Any) -> Any:

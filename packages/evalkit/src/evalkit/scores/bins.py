@@ -1,8 +1,8 @@
 """Scores by visibility, distance and viewpoint: tidy tables, one row for each bin and score.
 
-A bin holds values from its lower edge up to, but not with, its upper edge; the last bin of an axis holds its upper
-edge too. Rows without a value (visibility where the dataset says none) and rows beyond the edges are in no bin. Bins
-without rows are left out. Intervals are bootstrap intervals: all bins share their resamples.
+A bin holds values from its lower edge up to its upper edge, which belongs to it only in the last bin of an axis. Rows
+without a value (visibility where the dataset has none) and rows beyond the edges are in no bin. Bins without rows are
+left out. Intervals are bootstrap intervals with the same resamples for all bins.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ from posecore.errors import ConfigError
 from evalkit.error_table import column
 from evalkit.scores.bootstrap import RESAMPLES, Resampling, resample, units_of
 from evalkit.scores.per_pose import Values, score_values
-from evalkit.scores.totals import summed_up
+from evalkit.scores.totals import statistic_of
 
 Array = np.ndarray
 SCORES = ("vss_mean", "add_s_recall_0.1d", "re_sym_deg_median", "tz_mm_median", "add_mm_median")
@@ -35,19 +35,19 @@ def binned(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> pd.DataFrame:
-    """Scores in bins of one or several columns.
+    """Scores in bins of columns.
 
     Args:
         table: see `evalkit.error_table`.
         by: edges of the bins by column, rising; several columns give a grid.
-        scores: keys of `scores.values.score_values`.
+        scores: keys of `scores.per_pose.score_values`.
         resamples: of the bootstrap; 0 for no intervals.
         seed: of the draws.
 
     Returns:
         For each column `<column>_low` and `<column>_high`; `score`, `value` (NaN where no row has one), `low` and
-        `high` (95 % interval, NaN where there are fewer than two units), `expected`, `found`, `rows` (that have a part
-        in the score) and `units` (scenes or images among them).
+        `high` (95 % interval, NaN where there are fewer than two units), `expected`, `found`, `rows` (with a value of
+        the score) and `units` (their scenes or images).
 
     Raises:
         ConfigError: edges are not rising, or a score or column is unknown.
@@ -62,17 +62,17 @@ def binned(
         if len(edges) < 2 or any(not low < high for low, high in pairwise(edges)):
             raise ConfigError(f"bins: found edges {list(edges)} of {name}, expected two or more rising numbers")
     resampling = resample(units_of(table), resamples, seed) if resamples and len(table) else None
-    found = column(table, "found") > 0
+    is_found = column(table, "found") > 0
     rows: list[dict[str, Any]] = []
     for ends in product(*(list(pairwise(edges)) for edges in by.values())):
         inside = np.ones(len(table), bool)
-        place: dict[str, float] = {}
+        edges_of_bin: dict[str, float] = {}
         for (name, edges), (low, high) in zip(by.items(), ends, strict=True):
             inside &= _between(column(table, name), low, high, last=high == edges[-1])
-            place |= {f"{name}_low": low, f"{name}_high": high}
+            edges_of_bin |= {f"{name}_low": low, f"{name}_high": high}
         if inside.any():
-            counts = {"expected": int(inside.sum()), "found": int((inside & found).sum())}
-            rows += [place | _summed_up(name, values[name], inside, resampling) | counts for name in scores]
+            counts = {"expected": int(inside.sum()), "found": int((inside & is_found).sum())}
+            rows += [edges_of_bin | _summed_up(name, values[name], inside, resampling) | counts for name in scores]
     names = [f"{name}_{end}" for name in by for end in ("low", "high")]
     names += ["score", "value", "low", "high", "expected", "found", "rows", "units"]
     return pd.DataFrame(rows, columns=names)
@@ -89,17 +89,17 @@ def _summed_up(
     interval = None if resampling is None else resampling.interval(part)
     low, high = interval or (np.nan, np.nan)
     units = 0 if resampling is None else resampling.units_with(part.per_row)
-    known = int((~np.isnan(part.per_row)).sum())
-    return {"score": name, "value": summed_up(part), "low": low, "high": high, "rows": known, "units": units}
+    count = int((~np.isnan(part.per_row)).sum())
+    return {"score": name, "value": statistic_of(part), "low": low, "high": high, "rows": count, "units": units}
 
 
 def by_visibility(table: pd.DataFrame, edges: Sequence[float] = VISIBILITY_EDGES, **options: Any) -> pd.DataFrame:
-    """Scores by the visible share of the true silhouette; `options` are those of `binned`."""
+    """Scores by the visible fraction of the ground-truth silhouette; `options` are those of `binned`."""
     return binned(table, {"visib_fract": edges}, **options)
 
 
 def by_distance(table: pd.DataFrame, edges_m: Sequence[float] | None = None, **options: Any) -> pd.DataFrame:
-    """Scores by camera z of the true origin, metres.
+    """Scores by camera z of the ground-truth origin, metres.
 
     By default the edges are round numbers from the smallest to the largest distance.
     """

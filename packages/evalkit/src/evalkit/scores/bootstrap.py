@@ -1,9 +1,9 @@
-"""95 % intervals by resampling what was recorded together: whole scenes, or images where there is one scene only.
+"""95 % intervals by resampling poses recorded together: whole scenes, or images where there is one scene only.
 
-Poses of one scene share a camera, light and objects, those of one image even more: they are no independent draws, and
-resampling single poses would promise too narrow an interval. A resample draws as many units as there are, with
-replacement; all rows of a unit come with it. The interval runs between two percentiles of the resampled scores.
-With few units plain percentiles are too narrow, so they are moved outwards as a t interval is wider than a normal one
+Poses in the same scene have camera, light and objects in common, and in the same image even more: they are not
+independent, and resampling single poses would give too narrow an interval. A resample draws as many units as there are,
+with replacement, each with all its rows. The interval runs between two percentiles of the resampled scores. With few
+units plain percentiles are too narrow, so they are shifted outwards as a t interval is wider than a normal one
 ("expanded percentile"). Fewer than two units have no interval.
 
 Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, chapters 8 and 13; Hesterberg, "What Teachers
@@ -28,17 +28,17 @@ Interval = tuple[float, float] | None
 CONFIDENCE = 0.95
 RESAMPLES = 1000
 MAX_UNITS = 2000
-"""More units than this are joined to blocks of neighbours: the interval is no narrower and memory stays small."""
+"""More units than this are joined to blocks of neighbours: the interval stays as wide and memory small."""
 FAN = 64
-"""Into how many parts a search for a median cuts its range at each step."""
+"""Number of parts of the range at each step of a median search."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Units:
-    """What is drawn as a whole.
+    """Units of resampling: groups of rows drawn together.
 
     Attributes:
-        kind: what one unit is made of.
+        kind: of each unit.
         text: number and kind in words, such as "13 scenes" or "50 blocks of 20 images".
         of_row: the unit of each row, counted from 0.
         count: number of units.
@@ -51,12 +51,12 @@ class Units:
 
 
 def units_of(table: pd.DataFrame, block_images: int | None = None) -> Units:
-    """Scenes, or images where all rows are of one scene, or blocks of consecutive images where asked for.
+    """Scenes, or images if there is a single scene, or blocks of consecutive images.
 
     Args:
         table: with `scene_id` and `im_id`.
-        block_images: join so many consecutive images of a scene to one unit. For video, where a pose depends on the
-            frame before.
+        block_images: number of consecutive images of a scene in one unit, for video, where a pose depends on the
+            previous frame. None for no blocks.
 
     Raises:
         ConfigError: `block_images` is below 1.
@@ -71,7 +71,7 @@ def units_of(table: pd.DataFrame, block_images: int | None = None) -> Units:
     image_of_row = image_of_row.reshape(-1)
     if block_images is None:
         return _joined("image", image_of_row, len(images))
-    first = np.searchsorted(images[:, 0], images[:, 0])  # each image's first of its scene
+    first = np.searchsorted(images[:, 0], images[:, 0])  # index of the first image of each image's scene
     key = np.stack([images[:, 0], (np.arange(len(images)) - first) // block_images], axis=1)
     blocks, block_of_image = np.unique(key, axis=0, return_inverse=True)
     return Units(
@@ -96,28 +96,28 @@ def _text(kind: str, count: int, size: int) -> str:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Resampling:
-    """Drawn units, the same for every score that is asked of it, so that scores and differences stay paired.
+    """Drawn units, the same for every score, so that scores and differences stay paired.
 
     Attributes:
-        units: what is drawn.
-        weights: (r, u) how often each unit is in each resample.
+        units: to draw.
+        weights: (r, u) count of each unit in each resample.
     """
 
     units: Units
     weights: Float[Array, "r u"]
 
     def means(self, columns: Float[Array, "m n"]) -> Float[Array, "m r"]:
-        """Mean of each column over the rows of each resample; NaN values have no part, NaN where none is left."""
-        known = ~np.isnan(columns)
-        sums = np.stack([self._per_unit(column) for column in np.where(known, columns, 0.0)])
-        counts = np.stack([self._per_unit(part.astype(np.float64)) for part in known])
+        """Mean of each column over the rows of each resample; NaN values are left out, NaN without any other."""
+        is_valid = ~np.isnan(columns)
+        sums = np.stack([self._per_unit(column) for column in np.where(is_valid, columns, 0.0)])
+        counts = np.stack([self._per_unit(part.astype(np.float64)) for part in is_valid])
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((sums @ self.weights.T) / (counts @ self.weights.T))
 
     def medians(self, values: Float[Array, " n"]) -> Float[Array, " r"]:
-        """Median of the rows of each resample, exactly; NaN values have no part, NaN where none is left."""
-        known = np.flatnonzero(~np.isnan(values))
-        order = known[np.argsort(values[known], kind="stable")]
+        """Median of the rows of each resample, exactly; NaN values are left out, NaN without any other."""
+        is_valid = np.flatnonzero(~np.isnan(values))
+        order = is_valid[np.argsort(values[is_valid], kind="stable")]
         ordered, unit = values[order], self.units.of_row[order]
         total = self.weights @ np.bincount(unit, minlength=self.units.count)
         result = np.full(len(self.weights), np.nan)
@@ -129,7 +129,7 @@ class Resampling:
         return result
 
     def interval(self, values: Values) -> Interval:
-        """Interval of one score."""
+        """Interval of a score."""
         return self.intervals({"": values})[""]
 
     def intervals(self, values: Mapping[str, Values]) -> dict[str, Interval]:
@@ -145,7 +145,7 @@ class Resampling:
         return {name: self.ends(sampled[name], self.units_with(item.per_row)) for name, item in values.items()}
 
     def units_with(self, values: Float[Array, " n"]) -> int:
-        """Number of units with a known value."""
+        """Number of units with a value that is not NaN."""
         return len(np.unique(self.units.of_row[~np.isnan(values)]))
 
     def ends(self, sampled: Float[Array, " r"], units: int) -> Interval:
@@ -158,7 +158,7 @@ class Resampling:
 
     def _per_unit(self, values: Float[Array, " n"]) -> Float[Array, " u"]:
         sums = np.bincount(self.units.of_row, values, minlength=self.units.count)
-        return sums.astype(np.float64)  # of no rows numpy makes whole numbers
+        return sums.astype(np.float64)  # without rows numpy returns integers
 
 
 def resample(units: Units, resamples: int = RESAMPLES, seed: int = 0) -> Resampling:
@@ -177,7 +177,7 @@ def resample(units: Units, resamples: int = RESAMPLES, seed: int = 0) -> Resampl
 
 
 def outer_percentiles(units: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
-    """Percentiles, as shares, that cover `confidence` with so many units: those of a t interval, rescaled to a normal.
+    """Percentiles, as fractions, that cover `confidence` with so many units: a t interval's, rescaled to a normal.
 
     With 30 units they are 0.017 and 0.983 instead of 0.025 and 0.975.
     """
@@ -188,7 +188,7 @@ def outer_percentiles(units: int, confidence: float = CONFIDENCE) -> tuple[float
 
 
 def _search(unit: Int[Array, " n"], weights: Float[Array, "r u"], rank: Float[Array, " r"]) -> Int[Array, " r"]:
-    """For each resample the first place at which the weights so far exceed `rank`; `unit` is in order of value."""
+    """For each resample the first index at which the cumulative weight exceeds `rank`; `unit` is in order of value."""
     result = np.zeros(len(weights), np.int64)
     open_ranges: list[tuple[int, int, Array, Array]] = [(0, len(unit), np.arange(len(weights)), np.zeros(len(weights)))]
     while open_ranges:
@@ -201,12 +201,12 @@ def _search(unit: Int[Array, " n"], weights: Float[Array, "r u"], rank: Float[Ar
             counts = np.bincount(unit[start:stop] * FAN + part, minlength=weights.shape[1] * FAN)
             inside = weights[rows] @ counts.reshape(-1, FAN)
         reached = before[:, None] + np.cumsum(inside, axis=1)
-        place = np.argmax(reached > rank[rows, None], axis=1)
+        position = np.argmax(reached > rank[rows, None], axis=1)
         if stop - start <= FAN:
-            result[rows] = start + place
+            result[rows] = start + position
             continue
-        for which in np.unique(place):
-            here = np.flatnonzero(place == which)
+        for which in np.unique(position):
+            here = np.flatnonzero(position == which)
             passed = reached[here, which - 1] if which else before[here]
             open_ranges.append((int(edges[which]), int(edges[which + 1]), rows[here], passed))
     return result
@@ -217,12 +217,12 @@ class ScoreIntervals:
     """Intervals of a table's scores.
 
     Attributes:
-        kind: "scene" or "image", what was resampled.
-        text: the same with its number, in words.
-        units: how many were resampled.
-        resamples: how often.
+        kind: of the resampled units, "scene" or "image".
+        text: number and kind in words.
+        units: number of units.
+        resamples: number of resamples.
         seed: of the draws.
-        confidence: share of repetitions whose interval should hold the true score.
+        confidence: probability that the interval holds the expected score.
         intervals: by the score's key.
     """
 
@@ -260,14 +260,14 @@ def score_intervals(
 
     Args:
         table: see `evalkit.error_table`.
-        names: which scores, by key; all by default.
+        names: keys of the scores; all by default.
         resamples: number of resamples.
         seed: of the draws.
         block_images: see `units_of`.
     """
     resampling = resample(units_of(table, block_images), resamples, seed)
     values = score_values(table)
-    wanted = values if names is None else {name: values[name] for name in names}
+    chosen = values if names is None else {name: values[name] for name in names}
     return ScoreIntervals(
         kind=resampling.units.kind,
         text=resampling.units.text,
@@ -275,5 +275,5 @@ def score_intervals(
         resamples=resamples,
         seed=seed,
         confidence=CONFIDENCE,
-        intervals=resampling.intervals(wanted),
+        intervals=resampling.intervals(chosen),
     )

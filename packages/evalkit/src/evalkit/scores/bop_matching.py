@@ -1,8 +1,8 @@
-"""BOP's own matching of estimates to true instances, BOP19's average recalls and BOP24's average precision.
+"""BOP's matching of estimates to ground-truth instances, BOP19's average recalls and BOP24's average precision.
 
-Estimates of an object in an image are taken in order of score, equal ones in the file's order. Each takes the true
-instance with the smallest error under the threshold of those that are still free. This is done anew for every error
-and every threshold, so that one estimate may belong to different instances at different thresholds.
+Estimates of an object in an image are taken in order of score, equal ones in the file's order. Each takes the free
+instance with the smallest error under the threshold. Every error and every threshold has a matching of its own, so one
+estimate may be matched to different instances at different thresholds.
 
 Sources: Hodan et al., "BOP Challenge 2020", ECCVW 2020 (localization); "BOP Challenge 2024" (detection); and, where
 these leave a choice, bop_toolkit's pose_matching.py, score.py and eval_bop24_pose.py.
@@ -17,6 +17,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from evalkit.error_table import column
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores.definitions import (
     BOP24_ESTIMATES,
     BOP24_VISIBLE,
@@ -25,7 +26,6 @@ from evalkit.scores.definitions import (
     MSSD_DIAMETERS,
     MSSD_MM,
     RECALL_LEVELS,
-    VSD_COLUMNS,
     VSD_LIMITS,
 )
 from evalkit.scores.per_pose import in_diameters
@@ -37,212 +37,213 @@ TARGET = ["scene_id", "im_id", "obj_id"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class AllErrors:
-    """Every estimate of a result file against every true instance of its object in its image.
-
-    Only images that the targets name take part.
+    """Every estimate of a result file against every instance of its object in its image, for the targets' images.
 
     Attributes:
         estimates: `scene_id`, `im_id`, `obj_id`, `line` (in the file), `score`: one row for each estimate, also of
-            objects that the image does not hold.
-        truths: `scene_id`, `im_id`, `obj_id`, `gt_index`, `visib_fract` (NaN where unknown), `inst_count` (how many
-            of this object the targets ask for in the image, 0 where they do not), `diameter_m`, `image_width_px`: one
+            objects that the image does not contain.
+        instances: `scene_id`, `im_id`, `obj_id`, `gt_index`, `visib_fract` (NaN where unknown), `inst_count` (number
+            of this object in the image's target, 0 without one), `diameter_m`, `image_width_px`: one
             row for each annotated instance with a pose, also those that are no target.
-        errors: `estimate` and `truth` (positions in the two tables), `mssd_m`, `mspd_px` and, where there is depth,
-            `vsd_0.05` ... `vsd_0.50`: one row for each estimate and each true instance of its object in its image.
+        errors: `estimate` and `instance` (positions in the two tables), `mssd_m`, `mspd_px` and, where there is depth,
+            `vsd_0.05` ... `vsd_0.50`: one row for each estimate and each instance of its object in its image.
     """
 
     estimates: pd.DataFrame
-    truths: pd.DataFrame
+    instances: pd.DataFrame
     errors: pd.DataFrame
 
 
 def greedy_matches(
     estimate: Int[Array, " c"],
-    truth: Int[Array, " c"],
+    instance: Int[Array, " c"],
     error: Float[Array, " c"],
     rank: Int[Array, " e"],
-    truths: int,
+    instances: int,
     limits: Float[Array, " t"],
 ) -> Int[Array, "t e"]:
-    """Match estimates to true instances for every threshold at once.
+    """Match estimates to instances for every threshold at once.
 
     Args:
         estimate: of each pair, the estimate's position.
-        truth: of each pair, the true instance's position.
+        instance: of each pair, the instance's position.
         error: of each pair, in the limits' unit; NaN and infinity match nothing.
-        rank: place of each estimate in its image and object by score, 0 for the best; estimates that share a true
-            instance have different ranks.
-        truths: number of true instances.
-        limits: an error has to be under it.
+        rank: of each estimate in its image and object by score, 0 for the best; estimates of the same instance have
+            different ranks.
+        instances: number of instances.
+        limits: thresholds; an error at a threshold is not under it.
 
     Returns:
-        For each threshold and estimate the position of its true instance, -1 where it has none.
+        For each threshold and estimate the position of its instance, -1 without one.
     """
     matched = np.full((len(limits), len(rank)), -1, np.int64)
     if not len(error):
         return matched
-    order = np.lexsort((truth, estimate, rank[estimate]))
-    estimate, truth, error = estimate[order], truth[order], error[order]
+    order = np.lexsort((instance, estimate, rank[estimate]))
+    estimate, instance, error = estimate[order], instance[order], error[order]
     under = np.where(error < limits[:, None], error, np.inf)
-    free = np.ones((len(limits), truths), bool)
+    free = np.ones((len(limits), instances), bool)
     rounds = np.flatnonzero(np.diff(rank[estimate], prepend=-1))
     for start, stop in zip(rounds, [*rounds[1:], len(error)], strict=True):
         part = slice(start, stop)
-        open_errors = np.where(free[:, truth[part]], under[:, part], np.inf)
+        open_errors = np.where(free[:, instance[part]], under[:, part], np.inf)
         firsts = np.flatnonzero(np.diff(estimate[part], prepend=-1))
         sizes = np.diff([*firsts, stop - start])
         best = np.minimum.reduceat(open_errors, firsts, axis=1)
         is_best = (open_errors == np.repeat(best, sizes, axis=1)) & np.isfinite(open_errors)
-        places = np.where(is_best, np.arange(stop - start), stop - start)
-        chosen = np.minimum.reduceat(places, firsts, axis=1)  # the first of equally good ones
+        positions = np.where(is_best, np.arange(stop - start), stop - start)
+        chosen = np.minimum.reduceat(positions, firsts, axis=1)  # the first of equally good ones
         level, which = np.nonzero(np.isfinite(best))
-        taken = truth[part][chosen[level, which]]
+        taken = instance[part][chosen[level, which]]
         matched[level, estimate[part][firsts][which]] = taken
         free[level, taken] = False
     return matched
 
 
 def ranks(estimates: pd.DataFrame, among: list[str]) -> Int[Array, " e"]:
-    """Place of each estimate by falling score among those with the same ids; equal scores keep the table's order."""
+    """Rank of each estimate by falling score among those with the same ids; equal scores keep the table's order."""
     order = np.argsort(-column(estimates, "score"), kind="stable")
-    places = estimates.iloc[order].groupby(among, sort=False).cumcount().to_numpy()
+    positions = estimates.iloc[order].groupby(among, sort=False).cumcount().to_numpy()
     result = np.empty(len(estimates), np.int64)
-    result[order] = places
+    result[order] = positions
     return result
 
 
-def target_truths(truths: pd.DataFrame) -> Bool[Array, " g"]:
-    """Which instances a localization target means: the `inst_count` most visible; equal ones in the image's order."""
-    visible = np.nan_to_num(column(truths, "visib_fract"), nan=1.0)
-    order = np.lexsort((truths.gt_index.to_numpy(), -visible))
-    places = truths.iloc[order].groupby(TARGET, sort=False).cumcount().to_numpy()
-    place = np.empty(len(truths), np.int64)
-    place[order] = places
-    return np.asarray(place < truths.inst_count.to_numpy())
+def target_instances(instances: pd.DataFrame) -> Bool[Array, " g"]:
+    """Whether an instance is part of its localization target: the `inst_count` most visible, ties in image order."""
+    visible = np.nan_to_num(column(instances, "visib_fract"), nan=1.0)
+    order = np.lexsort((instances.gt_index.to_numpy(), -visible))
+    positions = instances.iloc[order].groupby(TARGET, sort=False).cumcount().to_numpy()
+    rank_in_image = np.empty(len(instances), np.int64)
+    rank_in_image[order] = positions
+    return np.asarray(rank_in_image < instances.inst_count.to_numpy())
 
 
-def bop19_shares(everything: AllErrors) -> pd.DataFrame:
-    """For each target instance the share of thresholds at which BOP19's matching gives it an estimate.
+def bop19_recalls(all_errors: AllErrors) -> pd.DataFrame:
+    """For each target instance the fraction of thresholds at which BOP19's matching assigns it an estimate.
 
     The mean of a column is BOP's average recall of that error, over any set of rows.
 
     Returns:
         `scene_id`, `im_id`, `obj_id`, `gt_index`, `bop19_mssd`, `bop19_mspd` and, where there is VSD, `bop19_vsd`.
     """
-    truths, errors = everything.truths, everything.errors
-    wanted = target_truths(truths)
-    rank = ranks(everything.estimates, TARGET)
-    estimate, truth = _positions(errors, "estimate"), _positions(errors, "truth")
-    kept = wanted[truth] & (rank[estimate] < truths.inst_count.to_numpy()[truth])
-    estimate, truth, errors = estimate[kept], truth[kept], errors[kept]
+    instances, errors = all_errors.instances, all_errors.errors
+    is_target = target_instances(instances)
+    rank = ranks(all_errors.estimates, TARGET)
+    estimate, instance = _positions(errors, "estimate"), _positions(errors, "instance")
+    kept = is_target[instance] & (rank[estimate] < instances.inst_count.to_numpy()[instance])
+    estimate, instance, errors = estimate[kept], instance[kept], errors[kept]
 
-    def share(error: Float[Array, " c"], limits: Float[Array, " t"]) -> Float[Array, " g"]:
-        matched = greedy_matches(estimate, truth, error, rank, len(truths), limits)
-        hits = np.bincount(matched[matched >= 0], minlength=len(truths))
+    def recall(error: Float[Array, " c"], limits: Float[Array, " t"]) -> Float[Array, " g"]:
+        matched = greedy_matches(estimate, instance, error, rank, len(instances), limits)
+        hits = np.bincount(matched[matched >= 0], minlength=len(instances))
         return np.asarray(hits / len(limits))
 
-    result = truths[[*TARGET, "gt_index"]].copy()
-    mssd_diameters, mspd_scaled_px = _scaled(errors, truths, truth)
-    result["bop19_mssd"] = share(mssd_diameters, MSSD_DIAMETERS)
-    result["bop19_mspd"] = share(mspd_scaled_px, MSPD_PX)
+    result = instances[[*TARGET, "gt_index"]].copy()
+    mssd_diameters, mspd_scaled_px = _scaled(errors, instances, instance)
+    result["bop19_mssd"] = recall(mssd_diameters, MSSD_DIAMETERS)
+    result["bop19_mspd"] = recall(mspd_scaled_px, MSPD_PX)
     if all(name in errors for name in VSD_COLUMNS):
-        result["bop19_vsd"] = np.mean([share(column(errors, name), VSD_LIMITS) for name in VSD_COLUMNS], axis=0)
-    return result[wanted].reset_index(drop=True)
+        result["bop19_vsd"] = np.mean([recall(column(errors, name), VSD_LIMITS) for name in VSD_COLUMNS], axis=0)
+    return result[is_target].reset_index(drop=True)
 
 
-def with_bop19(table: pd.DataFrame, everything: AllErrors) -> pd.DataFrame:
-    """The table of errors with BOP19's shares beside each expected pose, so that averages follow BOP's matching.
+def with_bop19(table: pd.DataFrame, all_errors: AllErrors) -> pd.DataFrame:
+    """The table of errors with BOP19's recalls for each expected pose, so that averages follow BOP's matching.
 
     Args:
         table: one row for each target instance.
-        everything: of the same result file and targets.
+        all_errors: of the same result file and targets.
     """
-    shares = bop19_shares(everything).drop(columns="obj_id")
-    return table.merge(shares, how="left", on=["scene_id", "im_id", "gt_index"], validate="many_to_one")
+    recalls = bop19_recalls(all_errors).drop(columns="obj_id")
+    return table.merge(recalls, how="left", on=["scene_id", "im_id", "gt_index"], validate="many_to_one")
 
 
 def bop24_precision(
-    everything: AllErrors,
+    all_errors: AllErrors,
     *,
     visible: float = BOP24_VISIBLE,
     per_image: int = BOP24_ESTIMATES,
     count_absent: bool = False,
 ) -> dict[str, Any]:
-    """BOP24's average precision of 6D detection: all estimates and all true instances of the targets' images.
+    """BOP24's average precision of 6D detection: all estimates and all instances of the targets' images.
 
-    Estimates matched to an instance that is hardly visible are left out, and such instances ask for nothing. Objects
-    without a visible instance have no part in the means. As in bop_toolkit, estimates of an object that the image
-    does not hold are left out too, although they are false alarms.
+    Instances that are hardly visible need no estimate, and estimates matched to such an instance are left out. Objects
+    without a visible instance are left out of the means. As in bop_toolkit, estimates of an object that the image does
+    not contain are left out too, although they are false positives.
 
     Args:
-        everything: see `AllErrors`.
-        visible: smallest visible share of an instance that has to be found; an unknown share counts as visible.
-        per_image: number of estimates of an image that count, those with the highest scores. BOP takes 200 for
-            XYZ-IBD.
-        count_absent: count estimates of absent objects as false alarms instead.
+        all_errors: see `AllErrors`.
+        visible: smallest visible fraction of an instance that needs an estimate; an unknown fraction is visible.
+        per_image: number of estimates counted in an image, those with the highest scores. BOP has 200 for XYZ-IBD.
+        count_absent: count estimates of absent objects as false positives instead.
 
     Returns:
         `ap` (mean of the next two), `ap_mssd`, `ap_mspd`, `ap_mssd_mm` (BOP25's, 2 to 20 mm), `by_object` (the same
-        for each), `estimates` and `instances` (how many counted), `outscored` and `absent` (how many estimates were
-        left out for their rank and for their object). NaN where there is no instance.
+        for each), `estimates` and `instances` (numbers counted), `outscored` and `absent` (numbers of estimates left
+        out for their rank and for their object). NaN where there is no instance.
     """
-    truths, estimates = everything.truths, everything.estimates
-    in_time = ranks(estimates, IMAGE) < per_image
-    asked = np.nan_to_num(column(truths, "visib_fract"), nan=1.0) >= visible
-    held = pd.MultiIndex.from_frame(truths[TARGET])
-    present = pd.MultiIndex.from_frame(estimates[TARGET]).isin(held)
-    counted = in_time if count_absent else in_time & present
+    instances, estimates = all_errors.instances, all_errors.estimates
+    is_kept = ranks(estimates, IMAGE) < per_image
+    is_visible = np.nan_to_num(column(instances, "visib_fract"), nan=1.0) >= visible
+    annotated = pd.MultiIndex.from_frame(instances[TARGET])
+    is_present = pd.MultiIndex.from_frame(estimates[TARGET]).isin(annotated)
+    is_counted = is_kept if count_absent else is_kept & is_present
     rank = ranks(estimates, TARGET)
-    estimate, truth = _positions(everything.errors, "estimate"), _positions(everything.errors, "truth")
-    kept = in_time[estimate]
-    estimate, truth, errors = estimate[kept], truth[kept], everything.errors[kept]
-    mssd_diameters, mspd_scaled_px = _scaled(errors, truths, truth)
+    estimate, instance = _positions(all_errors.errors, "estimate"), _positions(all_errors.errors, "instance")
+    kept = is_kept[estimate]
+    estimate, instance, errors = estimate[kept], instance[kept], all_errors.errors[kept]
+    mssd_diameters, mspd_scaled_px = _scaled(errors, instances, instance)
     kinds = {
         "ap_mssd": (mssd_diameters, MSSD_DIAMETERS),
         "ap_mspd": (mspd_scaled_px, MSPD_PX),
         "ap_mssd_mm": (column(errors, "mssd_m") * 1e3, MSSD_MM),
     }
+    precision = _precision_of(estimates, instances, is_counted, is_visible)
     by_object: dict[int, dict[str, float]] = {
-        int(obj_id): {} for obj_id in np.unique(truths.obj_id.to_numpy()[asked]).tolist()
+        int(obj_id): {} for obj_id in np.unique(instances.obj_id.to_numpy()[is_visible]).tolist()
     }
-    precision = _precision_of(estimates, truths, counted, asked)
     for name, (error, limits) in kinds.items():
-        matched = greedy_matches(estimate, truth, error, rank, len(truths), limits)
+        matched = greedy_matches(estimate, instance, error, rank, len(instances), limits)
         for obj_id, values in by_object.items():
             values[name] = precision(obj_id, matched)
+    return _with_means(by_object) | {
+        "by_object": by_object,
+        "estimates": int(is_counted.sum()),
+        "instances": int(is_visible.sum()),
+        "outscored": int((~is_kept).sum()),
+        "absent": int((is_kept & ~is_present).sum()),
+    }
+
+
+def _with_means(by_object: dict[int, dict[str, float]]) -> dict[str, Any]:
+    """Means over objects of every precision; adds `ap` to each object."""
     for values in by_object.values():
         values["ap"] = (values["ap_mssd"] + values["ap_mspd"]) / 2.0
-    totals = {
+    return {
         name: float(np.mean([values[name] for values in by_object.values()])) if by_object else float("nan")
-        for name in ("ap", *kinds)
-    }
-    return totals | {
-        "by_object": by_object,
-        "estimates": int(counted.sum()),
-        "instances": int(asked.sum()),
-        "outscored": int((~in_time).sum()),
-        "absent": int((in_time & ~present).sum()),
+        for name in ("ap", "ap_mssd", "ap_mspd", "ap_mssd_mm")
     }
 
 
 def _precision_of(
-    estimates: pd.DataFrame, truths: pd.DataFrame, counted: Bool[Array, " e"], asked: Bool[Array, " g"]
+    estimates: pd.DataFrame, instances: pd.DataFrame, is_counted: Bool[Array, " e"], is_visible: Bool[Array, " g"]
 ) -> Callable[[int, Int[Array, "t e"]], float]:
     """A function of an object and its matches at every threshold: the mean of its average precisions."""
     # bop_toolkit goes through images in the targets' order and keeps it among equal scores.
     order = np.lexsort((ranks(estimates, TARGET), estimates.im_id, estimates.scene_id))
     order = order[np.argsort(-column(estimates, "score")[order], kind="stable")]
-    order = order[counted[order]]
+    order = order[is_counted[order]]
     obj_ids = estimates.obj_id.to_numpy()
-    asked_or_none = np.append(asked, False)  # position -1: no match
+    is_visible_or_none = np.append(is_visible, False)  # position -1: no match
 
     def precision(obj_id: int, matched: Int[Array, "t e"]) -> float:
-        own = order[obj_ids[order] == obj_id]
-        instances = int((asked & (truths.obj_id.to_numpy() == obj_id)).sum())
+        of_object = order[obj_ids[order] == obj_id]
+        count = int((is_visible & (instances.obj_id.to_numpy() == obj_id)).sum())
         values = []
-        for match in matched[:, own]:
-            is_true = asked_or_none[match]
-            values.append(average_precision(is_true[is_true | (match < 0)], instances))
+        for match in matched[:, of_object]:
+            is_true = is_visible_or_none[match]
+            values.append(average_precision(is_true[is_true | (match < 0)], count))
         return float(np.mean(values))
 
     return precision
@@ -252,8 +253,8 @@ def average_precision(is_true: Bool[Array, " n"], instances: int) -> float:
     """Mean of the best precision at or beyond each of COCO's 101 levels of recall.
 
     Args:
-        is_true: whether each estimate, by falling score, is a true one.
-        instances: how many there were to find, at least 1.
+        is_true: whether each estimate, by falling score, is a true positive.
+        instances: number of instances, at least 1.
     """
     if not len(is_true):
         return 0.0
@@ -265,11 +266,11 @@ def average_precision(is_true: Bool[Array, " n"], instances: int) -> float:
 
 
 def _scaled(
-    errors: pd.DataFrame, truths: pd.DataFrame, truth: Int[Array, " c"]
+    errors: pd.DataFrame, instances: pd.DataFrame, instance: Int[Array, " c"]
 ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
     """MSSD in diameters, and MSPD in pixels of an image 640 wide."""
-    factor = MSPD_WIDTH_PX / column(truths, "image_width_px")[truth]
-    mssd_diameters = in_diameters(column(errors, "mssd_m"), column(truths, "diameter_m")[truth])
+    factor = MSPD_WIDTH_PX / column(instances, "image_width_px")[instance]
+    mssd_diameters = in_diameters(column(errors, "mssd_m"), column(instances, "diameter_m")[instance])
     return mssd_diameters, column(errors, "mspd_px") * factor
 
 

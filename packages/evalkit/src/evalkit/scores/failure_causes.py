@@ -1,31 +1,31 @@
-"""Why estimates failed: every failed one has exactly one cause.
+"""Failure analysis: exactly one cause for every failed estimate.
 
 A pose has failed where it is missing, or where its ADD(-S) is not under a limit, 0.1 diameter by default. Its error is
-taken apart in the camera's frame. The truth is the annotated pose turned by the object's known symmetry that leaves the
-smallest angle. The viewing ray runs from the camera's centre through the true origin.
+decomposed in the camera's frame. The ground truth is the symmetry-equivalent pose with the smallest angle to the
+estimate. The viewing ray runs from the camera's centre through the ground-truth origin.
 
 - z: the difference of origins along the ray, metres.
 - xy: the difference across the ray, metres.
 - in plane: the angle of the rotation error's twist about the ray.
 - out of plane: the angle of the rest of the rotation error (swing), about an axis across the ray.
-- An angle a moves model points by about 2 * 0.27 * sin(a / 2) diameters: 0.27 diameters is how far points lie from an
-  axis through the origin on average (0.24 to 0.30 for the eight objects of LM-O). So angles and lengths compare.
+- An angle a displaces model points by about 2 * 0.27 * sin(a / 2) diameters, so angles and lengths are comparable:
+  0.27 diameters is the mean distance of points from an axis through the origin (0.24 to 0.30 for LM-O's objects).
 
 The first of these that holds is the cause:
 
 1. `missed`: there is no estimate.
-2. `wrong instance`: MSSD to another true instance of the object in the image is under 0.2 diameter, and smaller than to
-   its own.
-3. `flip`: the rotation error is 160 degrees or more, that is half a turn about some axis, and the origins differ by
-   less than the limit.
-4. `near-symmetric flip`: the rotation error is 45 degrees or more, yet VSS is 0.8 or more: the wrong pose looks alike;
+2. `wrong instance`: MSSD to another instance of the object in the image is under 0.2 diameter, and smaller than to the
+   expected one.
+3. `flip`: the rotation error is 160 degrees or more, about 180 degrees about some axis, and the origins differ by less
+   than the limit.
+4. `near-symmetric flip`: the rotation error is 45 degrees or more, yet VSS is 0.8 or more, a similar silhouette;
    and the origins differ by less than the limit.
-5. `z only`, `in plane only` (xy and in plane), `rotation only` (in plane and out of plane): without these parts, what
-   the others move (root of the sum of squares) is under the limit, so that the pose would pass. Of several such causes
-   it is the one that leaves least, and the first named of equals.
-6. `large`: none of these alone would save it.
+5. `z only`, `in plane only` (xy and in plane), `rotation only` (in plane and out of plane): without these parts, the
+   displacement by the others (root of the sum of squares) is under the limit, so that the pose would pass. Of several
+   such causes the one with the least remaining displacement counts, and of equal ones the first in this list.
+6. `large`: the pose would fail without any one of these.
 
-Causes are estimates from the poses: they do not move the model's points, and for ADD-S they overrate rotations.
+Causes are estimated from the poses, not from displaced model points; for ADD-S they overrate rotations.
 """
 
 from collections.abc import Mapping
@@ -35,6 +35,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float
 from posecore import se3
+from posecore.symmetry import Symmetric, nearest_symmetric
 
 from evalkit.error_table import column
 from evalkit.scores.definitions import RECALL_DIAMETERS
@@ -46,30 +47,28 @@ FLIP_RAD = np.deg2rad(160.0)
 NEAR_FLIP_RAD = np.deg2rad(45.0)
 NEAR_FLIP_VSS = 0.8
 ARM_DIAMETERS = 0.27
-CHUNK = 3_000_000
-"""Largest number of poses times symmetries held at once."""
 
 CAUSES: Mapping[str, str] = {
     "missed": "no estimate",
-    "wrong instance": "closer than 0.2 diameter (MSSD) to another true instance of the object than to its own",
-    "flip": "rotation error of 160° or more, half a turn about some axis, with the origin in place",
+    "wrong instance": "within 0.2 diameter (MSSD) of another instance of the object, closer than to the expected one",
+    "flip": "rotation error of 160° or more, about 180° about some axis, with the origin in place",
     "near-symmetric flip": "rotation error of 45° or more but VSS of 0.8 or more, with the origin in place",
     "z only": "would pass without its error along the viewing ray",
-    "in plane only": "would pass without its shift across the viewing ray and its turn about it",
+    "in plane only": "would pass without its translation across the viewing ray and its rotation about the ray",
     "rotation only": "would pass without its rotation error",
-    "large": "several errors, none of which alone would save it",
+    "large": "several errors; would still fail without any single part",
 }
 SOLVED = ""
-"""What stands in place of a cause where a pose has not failed."""
+"""In place of a cause where a pose has not failed."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """A pose error taken apart, see the module; NaN where there is no estimate.
+    """Parts of a pose error, see the module; NaN where there is no estimate.
 
     Attributes:
         z_m: along the viewing ray, signed, positive for too far.
-        xy_m: across it.
+        xy_m: across the ray.
         angle_rad: of the whole rotation error.
         in_plane_rad: twist about the ray, -pi to pi.
         out_of_plane_rad: the rest of the rotation, 0 to pi.
@@ -83,18 +82,18 @@ class Parts:
 
 
 def parts_of(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"]) -> Parts:
-    """Take errors apart about each truth's viewing ray."""
+    """Decompose errors about the viewing ray of each ground-truth pose."""
     origin = T_gt[:, :3, 3]
     length = np.linalg.norm(origin, axis=1, keepdims=True)
     ray = np.divide(origin, length, out=np.tile([0.0, 0.0, 1.0], (len(origin), 1)), where=length > 0)
     shift = T_est[:, :3, 3] - origin
     z_m = np.sum(shift * ray, axis=1)
     xy_m = np.linalg.norm(shift - z_m[:, None] * ray, axis=1)
-    known = np.isfinite(T_est).all(axis=(1, 2)) & np.isfinite(T_gt).all(axis=(1, 2))
+    is_valid = np.isfinite(T_est).all(axis=(1, 2)) & np.isfinite(T_gt).all(axis=(1, 2))
     quat = np.full((len(origin), 4), np.nan)
-    if known.any():
-        turn = T_est[known, :3, :3] @ np.swapaxes(T_gt[known, :3, :3], 1, 2)
-        quat[known] = se3.quat_wxyz_from_rotation(turn)
+    if is_valid.any():
+        R = T_est[is_valid, :3, :3] @ np.swapaxes(T_gt[is_valid, :3, :3], 1, 2)
+        quat[is_valid] = se3.quat_wxyz_from_rotation(R)
     w, along = quat[:, 0], np.sum(quat[:, 1:] * ray, axis=1)
     twist = 2.0 * np.arctan2(along, w)
     across = np.linalg.norm(quat[:, 1:] - along[:, None] * ray, axis=1)
@@ -107,27 +106,11 @@ def parts_of(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"]) -> Parts
     )
 
 
-def nearest_truths(
-    T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], symmetries: Float[Array, "s 4 4"]
-) -> Float[Array, "n 4 4"]:
-    """Each truth turned by the symmetry that leaves the smallest angle to the estimate; the first of equals."""
-    nearest = np.empty_like(T_gt)
-    turns = symmetries[:, :3, :3].reshape(len(symmetries), 9)
-    step = max(1, CHUNK // len(symmetries))
-    for start in range(0, len(T_gt), step):
-        part = slice(start, start + step)
-        relative = np.swapaxes(T_gt[part, :3, :3], 1, 2) @ T_est[part, :3, :3]
-        traces = np.nan_to_num(relative.reshape(-1, 9) @ turns.T)
-        best = np.argmax(traces > traces.max(axis=1, keepdims=True) - 1e-9, axis=1)
-        nearest[part] = T_gt[part] @ symmetries[best]
-    return nearest
-
-
 def causes(
     table: pd.DataFrame,
     T_est: Float[Array, "n 4 4"],
     T_gt: Float[Array, "n 4 4"],
-    symmetries: Mapping[int, Float[Array, "_ 4 4"]] | None = None,
+    infos: Mapping[int, Symmetric] | None = None,
     *,
     limit_diameters: float = RECALL_DIAMETERS,
 ) -> "pd.Series[str]":
@@ -136,9 +119,8 @@ def causes(
     Args:
         table: see `evalkit.error_table`.
         T_est: estimates `T_cam_obj` of its rows, metres, NaN where missing.
-        T_gt: true poses.
-        symmetries: of each object, as `posecore.bop.symmetry_transforms` gives them; the identity alone for objects
-            that are not in it.
+        T_gt: ground-truth poses.
+        infos: symmetries of the objects; objects without an entry have none.
         limit_diameters: an ADD(-S) of so many diameters or more is a failure.
 
     Returns:
@@ -146,13 +128,13 @@ def causes(
     """
     failed = ~solved(table, limit_diameters)
     diameter_m = column(table, "diameter_m")
-    T_true = T_gt.astype(np.float64)
-    for obj_id, transforms in (symmetries or {}).items():
-        own = np.flatnonzero(failed & (table.obj_id.to_numpy() == obj_id))
-        if len(transforms) > 1 and len(own):
-            T_true[own] = nearest_truths(T_est[own], T_true[own], transforms)
-    parts = parts_of(T_est, T_true)
-    found = column(table, "found") > 0
+    T_nearest = T_gt.astype(np.float64)
+    for obj_id, info in (infos or {}).items():
+        rows = np.flatnonzero(failed & (table.obj_id.to_numpy() == obj_id))
+        if (info.symmetries_discrete or info.symmetries_continuous) and len(rows):
+            T_nearest[rows] = nearest_symmetric(T_nearest[rows], T_est[rows], info)
+    parts = parts_of(T_est, T_nearest)
+    is_found = column(table, "found") > 0
     other = column(table, "other_mssd_m")
     chosen = np.full(len(table), SOLVED, dtype=object)
     chosen[failed] = "large"
@@ -164,18 +146,18 @@ def causes(
     chosen[failed & in_place & (parts.angle_rad >= FLIP_RAD)] = "flip"
     is_other = (other < OTHER_DIAMETERS * diameter_m) & (other < column(table, "mssd_m"))
     chosen[failed & is_other] = "wrong instance"
-    chosen[failed & ~found] = "missed"
+    chosen[failed & ~is_found] = "missed"
     return pd.Series(pd.Categorical(chosen, categories=[SOLVED, *CAUSES]), index=table.index, name="cause")
 
 
 def _alone(
     parts: Parts, diameter_m: Float[Array, " n"], limit_diameters: float
 ) -> tuple[Bool[Array, " n"], np.ndarray]:
-    """Whether one kind of error alone makes a pose fail, and which."""
+    """Whether a pose would pass without one kind of error, and which kind."""
     z, xy = parts.z_m / diameter_m, parts.xy_m / diameter_m
     left = {
-        "z only": np.hypot(xy, _moved(parts.angle_rad)),
-        "in plane only": np.hypot(z, _moved(parts.out_of_plane_rad)),
+        "z only": np.hypot(xy, _displacement(parts.angle_rad)),
+        "in plane only": np.hypot(z, _displacement(parts.out_of_plane_rad)),
         "rotation only": np.hypot(z, xy),
     }
     rest = np.nan_to_num(np.stack(list(left.values())), nan=np.inf)
@@ -183,13 +165,13 @@ def _alone(
     return np.min(rest, axis=0) < limit_diameters, np.array(list(left), dtype=object)[best]
 
 
-def _moved(angle_rad: Float[Array, " n"]) -> Float[Array, " n"]:
-    """How far an angle moves model points, diameters."""
+def _displacement(angle_rad: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Displacement of model points by a rotation, diameters."""
     return np.asarray(2.0 * ARM_DIAMETERS * np.sin(angle_rad / 2.0))
 
 
 def cause_counts(table: pd.DataFrame, cause: "pd.Series[str]") -> pd.DataFrame:
-    """How many poses failed and of which cause, by object and in total.
+    """Number of failed poses by cause, by object and in total.
 
     Returns:
         Rows by object id as text, and "total" last; columns `expected`, `failed` and the keys of `CAUSES`.
@@ -197,7 +179,7 @@ def cause_counts(table: pd.DataFrame, cause: "pd.Series[str]") -> pd.DataFrame:
     rows = {str(obj_id): cause[table.obj_id == obj_id] for obj_id in sorted(table.obj_id.unique())} | {"total": cause}
     counts = {}
     for name, part in rows.items():
-        found = part.value_counts()
-        each = {key: int(found.get(key, 0)) for key in CAUSES}
+        by_cause = part.value_counts()
+        each = {key: int(by_cause.get(key, 0)) for key in CAUSES}
         counts[name] = {"expected": len(part), "failed": sum(each.values()), **each}
     return pd.DataFrame.from_dict(counts, orient="index", columns=["expected", "failed", *CAUSES])

@@ -1,4 +1,4 @@
-"""Every score as one value for each row: what means, medians, bins and bootstrap intervals are taken of."""
+"""Every score as one value for each row, for means, medians, bins and bootstrap intervals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,6 +9,7 @@ import pandas as pd
 from jaxtyping import Bool, Float
 
 from evalkit.error_table import column
+from evalkit.pose_errors.metrics import VSD_COLUMNS
 from evalkit.scores.definitions import (
     AUC_LIMIT_DIAMETERS,
     AUC_LIMIT_M,
@@ -20,7 +21,6 @@ from evalkit.scores.definitions import (
     RECALL_DIAMETERS,
     ROUNDING_M,
     ROUNDING_RAD,
-    VSD_COLUMNS,
     VSD_LIMITS,
 )
 
@@ -30,11 +30,11 @@ Statistic = Literal["mean", "median"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Values:
-    """A score before it is summed up.
+    """A score before averaging.
 
     Attributes:
-        per_row: one value for each row, NaN where the row has no part in the score.
-        statistic: what the score is of them.
+        per_row: one value for each row, NaN where the row is left out.
+        statistic: of the values.
     """
 
     per_row: Float[Array, " n"]
@@ -44,11 +44,11 @@ class Values:
 def score_values(table: pd.DataFrame) -> dict[str, Values]:
     """All scores that are a mean or a median over rows, by key; keys carry units.
 
-    A missing estimate is 0 in shares, recalls, areas and VSS, 1 in `diverged`, and has no part in errors.
+    A missing estimate is 0 in fractions, recalls, areas and VSS, 1 in `diverged`, and left out of errors.
     """
-    found = column(table, "found") > 0
+    is_found = column(table, "found") > 0
     vss = column(table, "vss")
-    means = {"vss_mean": vss, "vss_mean_found": np.where(found, vss, np.nan)}
+    means = {"vss_mean": vss, "vss_mean_found": np.where(is_found, vss, np.nan)}
     means |= _recalls(table) | average_recalls(table)
     means["diverged"] = diverged(table).astype(np.float64)
     values = {name: Values(per_row=per_row, statistic="mean") for name, per_row in means.items()}
@@ -56,7 +56,7 @@ def score_values(table: pd.DataFrame) -> dict[str, Values]:
         values[f"{name}_mean"] = Values(per_row=errors, statistic="mean")
         values[f"{name}_median"] = Values(per_row=errors, statistic="median")
     time_s = column(table, "time_s")
-    time_s = np.where(found & (time_s >= 0), time_s, np.nan)
+    time_s = np.where(is_found & (time_s >= 0), time_s, np.nan)
     values["time_s_mean"] = Values(per_row=time_s, statistic="mean")
     values["time_s_per_image"] = Values(per_row=_once_an_image(table, time_s), statistic="mean")
     return values
@@ -66,7 +66,7 @@ def _recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     diameter = column(table, "diameter_m")
     add, adi, add_s = column(table, "add_m"), column(table, "adi_m"), add_s_m(table)
     re_sym_deg = np.rad2deg(column(table, "re_sym_rad"))
-    shares = {
+    fractions = {
         "add_recall_0.1d": in_diameters(add, diameter) < RECALL_DIAMETERS,
         "adi_recall_0.1d": in_diameters(adi, diameter) < RECALL_DIAMETERS,
         "add_s_recall_0.1d": in_diameters(add_s, diameter) < RECALL_DIAMETERS,
@@ -77,7 +77,7 @@ def _recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     for name, error in (("add", add), ("adi", adi), ("add_s", add_s)):
         areas[f"{name}_auc_100mm"] = area_under_recall(error, AUC_LIMIT_M)
         areas[f"{name}_auc_0.1d"] = area_under_recall(error, AUC_LIMIT_DIAMETERS * diameter)
-    return {name: np.asarray(share, np.float64) for name, share in shares.items()} | areas
+    return {name: np.asarray(fraction, np.float64) for name, fraction in fractions.items()} | areas
 
 
 def in_diameters(error_m: Float[Array, " n"], diameter_m: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -86,10 +86,10 @@ def in_diameters(error_m: Float[Array, " n"], diameter_m: Float[Array, " n"]) ->
 
 
 def area_under_recall(errors: Float[Array, " n"], limit: float | Float[Array, " n"]) -> Float[Array, " n"]:
-    """Each error's part in the area under the recall curve from 0 to `limit`: the mean of these is the exact area.
+    """Contribution of each error to the area under the recall curve from 0 to `limit`: their mean is the exact area.
 
     Args:
-        errors: NaN where an estimate is missing, which adds nothing.
+        errors: NaN where an estimate is missing, with contribution 0.
         limit: largest threshold, in the errors' unit, one for all or one for each.
     """
     return np.nan_to_num(1.0 - errors / limit, nan=0.0).clip(0.0, 1.0)
@@ -101,25 +101,27 @@ def add_s_m(table: pd.DataFrame) -> Float[Array, " n"]:
 
 
 def solved(table: pd.DataFrame, limit_diameters: float = RECALL_DIAMETERS) -> Bool[Array, " n"]:
-    """Rows with an ADD(-S) under a share of the diameter; missing ones are not."""
+    """Rows with an ADD(-S) under a fraction of the diameter; missing ones are not."""
     return np.asarray(in_diameters(add_s_m(table), column(table, "diameter_m")) < limit_diameters)
 
 
 def average_recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
-    """BOP19's average recalls, for each row the share of thresholds that it meets.
+    """BOP19's average recalls: for each row the fraction of thresholds that it is under.
 
-    Columns `bop19_mssd`, `bop19_mspd`, `bop19_vsd` (see `scores.bop.bop19_shares`) are taken where they are: they hold
-    BOP's own matching of several instances. Otherwise the errors of the row's own estimate count, which is the same
-    where a target asks for one instance.
+    Columns `bop19_mssd`, `bop19_mspd`, `bop19_vsd` (see `bop_matching.bop19_recalls`) are used where present: they hold
+    BOP's matching of several instances. Otherwise the errors of the row's estimate count, which is the same for
+    targets with a single instance.
 
     Returns:
         `ar_mssd`, `ar_mspd`, `ar_vsd`, `ar` and `ar_without_vsd`; `ar_vsd` and `ar` are NaN in every row where VSD was
         not computed, or not for all estimates (images without depth).
     """
     diameter, width = column(table, "diameter_m"), column(table, "image_width_px")
-    mssd = _own(table, "bop19_mssd", lambda: under(in_diameters(column(table, "mssd_m"), diameter), MSSD_DIAMETERS))
-    mspd = _own(table, "bop19_mspd", lambda: under(column(table, "mspd_px") * (MSPD_WIDTH_PX / width), MSPD_PX))
-    vsd = _own(table, "bop19_vsd", lambda: _vsd_shares(table))
+    mssd = _column_or(
+        table, "bop19_mssd", lambda: under(in_diameters(column(table, "mssd_m"), diameter), MSSD_DIAMETERS)
+    )
+    mspd = _column_or(table, "bop19_mspd", lambda: under(column(table, "mspd_px") * (MSPD_WIDTH_PX / width), MSPD_PX))
+    vsd = _column_or(table, "bop19_vsd", lambda: _vsd_recalls(table))
     return {
         "ar": (vsd + mssd + mspd) / 3.0,
         "ar_without_vsd": (mssd + mspd) / 2.0,
@@ -129,17 +131,17 @@ def average_recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     }
 
 
-def _own(table: pd.DataFrame, name: str, otherwise: Callable[[], Array]) -> Float[Array, " n"]:
+def _column_or(table: pd.DataFrame, name: str, otherwise: Callable[[], Array]) -> Float[Array, " n"]:
     return column(table, name) if name in table else otherwise()
 
 
 def under(errors: Float[Array, " n"], limits: Float[Array, " t"]) -> Float[Array, " n"]:
-    """For each error the share of limits that it lies under; NaN lies under none."""
+    """For each error the fraction of limits above; 0 for NaN."""
     below = len(limits) - np.searchsorted(limits, errors, side="right")
     return np.where(np.isfinite(errors), below, 0) / len(limits)
 
 
-def _vsd_shares(table: pd.DataFrame) -> Float[Array, " n"]:
+def _vsd_recalls(table: pd.DataFrame) -> Float[Array, " n"]:
     nothing = np.full(len(table), np.nan)
     if not all(name in table for name in VSD_COLUMNS):
         return nothing
@@ -167,16 +169,16 @@ def found_errors(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
 
 
 def diverged(table: pd.DataFrame) -> Bool[Array, " n"]:
-    """Rows that are missing, rotated by over 45 degrees or moved by over half a diameter."""
+    """Rows that are missing, rotated by over 45 degrees or translated by over half a diameter."""
     rotated = column(table, "re_sym_rad") > DIVERGED_RAD + ROUNDING_RAD
-    moved = column(table, "te_m") > DIVERGED_DIAMETERS * column(table, "diameter_m") + ROUNDING_M
-    return np.asarray(rotated | moved | (column(table, "found") == 0))
+    translated = column(table, "te_m") > DIVERGED_DIAMETERS * column(table, "diameter_m") + ROUNDING_M
+    return np.asarray(rotated | translated | (column(table, "found") == 0))
 
 
 def _once_an_image(table: pd.DataFrame, values: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The first known value of each image, NaN in its other rows: BOP gives one time to all estimates of an image."""
-    known = np.flatnonzero(np.isfinite(values))
-    first = ~table.iloc[known].duplicated(["scene_id", "im_id"]).to_numpy()
+    """The first finite value of each image, NaN in its other rows: in BOP all estimates of an image have one time."""
+    timed = np.flatnonzero(np.isfinite(values))
+    first = ~table.iloc[timed].duplicated(["scene_id", "im_id"]).to_numpy()
     kept = np.full(len(values), np.nan)
-    kept[known[first]] = values[known[first]]
+    kept[timed[first]] = values[timed[first]]
     return kept

@@ -1,4 +1,4 @@
-"""Tables to scores: means, medians, recalls and areas under curves, with missing estimates counted as failures."""
+"""Scores of a table: means, medians, recalls and areas under curves, with missing estimates as failures."""
 
 from typing import Any
 
@@ -14,15 +14,15 @@ Array = np.ndarray
 def scores(table: pd.DataFrame) -> dict[str, Any]:
     """Scores of a table: counts, and the mean or median of every entry of `score_values`.
 
-    Keys carry units. A value without rows behind it is NaN.
+    Keys end in units. A score without rows is NaN.
     """
-    found = int((column(table, "found") > 0).sum())
-    counts = {"expected": len(table), "found": found, "missing": len(table) - found}
-    return counts | {name: summed_up(values) for name, values in score_values(table).items()}
+    found_count = int((column(table, "found") > 0).sum())
+    counts = {"expected": len(table), "found": found_count, "missing": len(table) - found_count}
+    return counts | {name: statistic_of(values) for name, values in score_values(table).items()}
 
 
-def summed_up(values: Values) -> float:
-    """Mean or median of the rows that have a part in a score; NaN where none has."""
+def statistic_of(values: Values) -> float:
+    """Mean or median of a score over its rows; NaN without rows."""
     kept = values.per_row[~np.isnan(values.per_row)]
     if not len(kept):
         return float("nan")

@@ -1,18 +1,20 @@
-"""The tables of a report, described once: the page, Markdown and LaTeX show the same rows and numbers."""
+"""The tables of a report, defined once for the page, Markdown and LaTeX."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Literal
 
-from evalkit.scores.convergence import level_tables
 from evalkit.scores.failure_causes import CAUSES
-from evalkit.tables.model import Better, Cell, Column, Interval, Row, Table
+from evalkit.tables.convergence import level_tables
+from evalkit.tables.model import Better, Cell, Interval, Row, Table, TableColumn
 
 Values = Mapping[str, Any]
 Best = Literal["column", "row", ""]
+TOTAL = "total"
 
 
-def _column(group: str, heading: str, key: str, unit: str, digits: int, better: Better = "") -> Column:
-    return Column(key=key, heading=heading, group=group, unit=unit, digits=digits, better=better)
+def _column(group: str, heading: str, key: str, unit: str, digits: int, better: Better = "") -> TableColumn:
+    return TableColumn(key=key, heading=heading, group=group, unit=unit, digits=digits, better=better)
 
 
 SCORE_COLUMNS = (
@@ -23,9 +25,9 @@ SCORE_COLUMNS = (
     _column("recall at 0.1 diameter", "ADD", "add_recall_0.1d", "%", 1, "higher"),
     _column("recall at 0.1 diameter", "ADI", "adi_recall_0.1d", "%", 1, "higher"),
     _column("recall at 0.1 diameter", "ADD(-S)", "add_s_recall_0.1d", "%", 1, "higher"),
-    _column("share", "5 cm 5°", "5cm5deg", "%", 1, "higher"),
-    _column("share", "proj. 5 px", "proj_5px", "%", 1, "higher"),
-    _column("share", "diverged", "diverged", "%", 1, "lower"),
+    _column("fraction", "5 cm 5°", "5cm5deg", "%", 1, "higher"),
+    _column("fraction", "proj. 5 px", "proj_5px", "%", 1, "higher"),
+    _column("fraction", "diverged", "diverged", "%", 1, "lower"),
 )
 AREA_COLUMNS = (
     _column("AUC to 100 mm", "ADD", "add_auc_100mm", "", 3, "higher"),
@@ -49,7 +51,7 @@ PRECISION_COLUMNS = (
 )
 
 
-def _mean_and_median(group: str, key: str, unit: str, digits: int = 2) -> tuple[Column, Column]:
+def _mean_and_median(group: str, key: str, unit: str, digits: int = 2) -> tuple[TableColumn, TableColumn]:
     return (
         _column(group, "mean", f"{key}_mean", unit, digits, "lower"),
         _column(group, "median", f"{key}_median", unit, digits, "lower"),
@@ -72,7 +74,7 @@ SURFACE_COLUMNS = (
     *_mean_and_median("MSPD", "mspd_px", "px"),
     _column("run time", "an image", "time_s_per_image", "s", 3, "lower"),
 )
-ERRORS_NOTE = "Errors are over the estimates that were found."
+ERRORS_NOTE = "Errors are over the estimates found."
 PRECISION_NOTE = "Over all lines of the file with their scores, and all instances; a total is the mean over objects."
 SCORE_TABLES = (
     ("Scores", "scores", SCORE_COLUMNS, ""),
@@ -81,23 +83,23 @@ SCORE_TABLES = (
     ("Rotation and translation errors", "pose-errors", POSE_COLUMNS, ERRORS_NOTE),
     ("Distances of origins, surfaces and projections", "surface-errors", SURFACE_COLUMNS, ERRORS_NOTE),
 )
-"""Title, name, columns and note of the tables that every file has, in total and by object."""
+"""Title, name, columns and note of the tables of every file, in total and by object."""
 COMPARED = (
     _column("", "VSS mean", "vss_mean", "", 3, "higher"),
     _column("", "ADD(-S) recall at 0.1 diameter", "add_s_recall_0.1d", "%", 1, "higher"),
     _column("", "Median rotation error (best symmetry)", "re_sym_deg_median", "deg", 1, "lower"),
     _column("", "Median distance of the origins", "te_mm_median", "mm", 1, "lower"),
 )
-"""Scores that files are set side by side in, object by object."""
+"""Scores compared between files, object by object."""
 
 
 BIN_AXES: Mapping[str, tuple[str, str, float]] = {
-    "visibility": ("visible share of the true silhouette", "visib_fract", 1.0),
+    "visibility": ("visible fraction of the ground-truth silhouette", "visib_fract", 1.0),
     "distance": ("camera z of the object's origin, m", "distance_m", 1.0),
     "azimuth": ("camera's azimuth seen from the object, degrees", "view_azimuth_deg", 1.0),
     "elevation": ("camera's elevation seen from the object, degrees", "view_elevation_deg", 1.0),
 }
-"""What poses are binned by: its words with unit, its column, the factor to that unit."""
+"""Axes of the bins: label with unit, column of the error table, factor to that unit."""
 BIN_COLUMNS = (
     _column("", "mean VSS", "vss_mean", "", 3, "higher"),
     _column("", "ADD(-S) 0.1 d", "add_s_recall_0.1d", "%", 1, "higher"),
@@ -111,7 +113,7 @@ CAUSE_COLUMNS = (
     _column("poses", "expected", "expected", "", 0),
     _column("poses", "failed", "failed", "%", 1),
     *(
-        Column(key=cause, heading=cause, group="failed because of", unit="%", digits=1, about=text)
+        TableColumn(key=cause, heading=cause, group="failed because of", unit="%", digits=1, about=text)
         for cause, text in CAUSES.items()
     ),
 )
@@ -135,16 +137,14 @@ def report_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def total_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """A row for each result file: its scores, and its errors."""
-    rows = [
-        ({"name": file["name"]}, file["total"], file["intervals"]["total"]["intervals"]) for file in summary["files"]
-    ]
-    first = Column(key="name", heading="result file")
+    """Scores and errors in total, a row for each result file."""
+    rows = [(file["name"], *_scores(file, TOTAL)) for file in summary["files"]]
+    first = TableColumn(key="name", heading="result file")
     resampled = ", ".join(dict.fromkeys(_resampled(file["intervals"]["total"]) for file in summary["files"]))
     interval_note = _interval_note(resampled)
     tables = [
-        _table(title, name, first, rows, columns, note=note if place else interval_note)
-        for place, (title, name, columns, note) in enumerate(SCORE_TABLES)
+        _table(title, name, first, rows, columns, note=note if index else interval_note)
+        for index, (title, name, columns, note) in enumerate(SCORE_TABLES)
     ]
     return [table for table in tables if len(table.columns) > 1]
 
@@ -152,19 +152,14 @@ def total_tables(summary: Mapping[str, Any]) -> list[Table]:
 def object_tables(summary: Mapping[str, Any]) -> dict[str, list[Table]]:
     """For each result file, by name: scores and errors of its objects and in total."""
     tables = {}
-    for place, file in enumerate(summary["files"]):
-        name, intervals = file["name"], file["intervals"]
-        rows = [
-            ({"name": f"object {obj_id}"}, values, intervals["by_object"][obj_id]["intervals"])
-            for obj_id, values in file["by_object"].items()
-        ]
-        rows.append(({"name": "total"}, file["total"], intervals["total"]["intervals"]))
-        first = Column(key="name", heading="object")
+    for index, file in enumerate(summary["files"]):
+        rows = [(_group_name(group), *_scores(file, group)) for group in (*file["by_object"], TOTAL)]
+        first = TableColumn(key="name", heading="object")
         described = [
-            _table(f"{title} of {name} by object", f"{slug}-objects-{place}", first, rows, columns, True, note)
+            _table(f"{title} of {file['name']} by object", f"{slug}-objects-{index}", first, rows, columns, True, note)
             for title, slug, columns, note in SCORE_TABLES
         ]
-        tables[name] = [table for table in described if len(table.columns) > 1]
+        tables[file["name"]] = [table for table in described if len(table.columns) > 1]
     return tables
 
 
@@ -176,37 +171,34 @@ def comparison_tables(summary: Mapping[str, Any]) -> list[Table]:
     obj_ids = sorted({obj_id for file in files for obj_id in file["by_object"]}, key=int)
     tables = []
     for shown in COMPARED:
-        columns = [
-            Column(
-                key=f"{shown.key}_{place}",
-                heading=file["name"],
-                unit=shown.unit,
-                digits=shown.digits,
-                better=shown.better,
-            )
-            for place, file in enumerate(files)
-        ]
+        columns = [replace(shown, key=f"{shown.key}_{index}", heading=file["name"]) for index, file in enumerate(files)]
         rows = []
-        for obj_id in obj_ids:
-            cells: dict[str, Cell] = {"object": f"object {obj_id}"}
+        for group in (*obj_ids, TOTAL):
+            cells: dict[str, Cell] = {"object": _group_name(group)}
             for column, file in zip(columns, files, strict=True):
-                intervals = file["intervals"]["by_object"].get(obj_id, {}).get("intervals", {})
-                cells[column.key] = _cell(file["by_object"].get(obj_id, {}), intervals, shown.key)
-            rows.append(Row(cells=cells))
-        total: dict[str, Cell] = {"object": "total"}
-        for column, file in zip(columns, files, strict=True):
-            total[column.key] = _cell(file["total"], file["intervals"]["total"]["intervals"], shown.key)
-        rows.append(Row(cells=total, total=True))
+                cells[column.key] = _cell(*_scores(file, group), shown.key)
+            rows.append(Row(cells=cells, total=group == TOTAL))
         tables.append(
             Table(
                 title=shown.heading,
                 name=f"compare-{shown.key.replace('_', '-').replace('.', '')}",
-                columns=[Column(key="object", heading="object"), *columns],
+                columns=[TableColumn(key="object", heading="object"), *columns],
                 rows=rows,
                 best="row",
             )
         )
     return tables
+
+
+def _scores(file: Values, group: str) -> tuple[Values, Values]:
+    """Scores and intervals of an object of a file, or of all objects under `TOTAL`; empty without that object."""
+    if group == TOTAL:
+        return file["total"], file["intervals"]["total"]["intervals"]
+    return file["by_object"].get(group, {}), file["intervals"]["by_object"].get(group, {}).get("intervals", {})
+
+
+def _group_name(group: str) -> str:
+    return group if group == TOTAL else f"object {group}"
 
 
 def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
@@ -215,16 +207,16 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
     tables = []
     for axis, (label, name, factor) in BIN_AXES.items():
         rows: dict[tuple[float, int], dict[str, Cell]] = {}
-        for place, file in enumerate(summary["files"]):
+        for index, file in enumerate(summary["files"]):
             for record in file["bins"][axis]:
                 low, high = factor * record[f"{name}_low"], factor * record[f"{name}_high"]
-                cells = rows.setdefault((low, place), {"low": low, "high": high, "expected": record["expected"]})
+                cells = rows.setdefault((low, index), {"low": low, "high": high, "expected": record["expected"]})
                 cells[record["score"]] = _cell(record, {"value": (record["low"], record["high"])}, "value")
                 cells |= {"found": record["found"]} | ({"file": file["name"]} if several else {})
         if rows:
             digits = 0 if all(low == round(low) for low, _ in rows) else 2
             first = [_column(axis, heading, key, "", digits) for heading, key in (("from", "low"), ("to", "high"))]
-            first += [Column(key="file", heading="result file")] if several else []
+            first += [TableColumn(key="file", heading="result file")] if several else []
             counts = [_column("poses", key, key, "", 0) for key in ("expected", "found")]
             described = [Row(cells=cells, group=f"{low:g}") for (low, _), cells in sorted(rows.items())]
             tables.append(
@@ -240,52 +232,54 @@ def bin_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 
 def cause_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Why poses failed, see `evalkit.scores.failure_causes`: causes down, result files across; then a table a file."""
+    """Causes of failures (`evalkit.scores.failure_causes`): causes down, files across; then a table for each file."""
     files = summary["files"]
-    columns = [Column(key="cause", heading="cause")]
+    columns = [TableColumn(key="cause", heading="cause")]
     rows: dict[str, dict[str, Cell]] = {
         cause: {"cause": cause, "meaning": CAUSES.get(cause, "")} for cause in (*CAUSES, "all failures")
     }
-    for place, file in enumerate(files):
-        poses, share = f"poses_{place}", f"share_{place}"
-        columns += [_column(file["name"], "poses", poses, "", 0), _column(file["name"], "share", share, "%", 1)]
+    for index, file in enumerate(files):
+        poses, fraction = f"poses_{index}", f"fraction_{index}"
+        columns += [_column(file["name"], "poses", poses, "", 0), _column(file["name"], "fraction", fraction, "%", 1)]
         counts = file["causes"]["total"]
         for cause, cells in rows.items():
             count = counts["failed" if cause == "all failures" else cause]
-            cells |= {poses: count, share: count / counts["expected"] if counts["expected"] else None}
-    columns.append(Column(key="meaning", heading="what it means"))
+            cells |= {poses: count, fraction: count / counts["expected"] if counts["expected"] else None}
+    columns.append(TableColumn(key="meaning", heading="meaning"))
     return [
         Table(
             title="Failures by cause",
             name="causes",
             columns=columns,
             rows=[Row(cells=cells, total=cause == "all failures") for cause, cells in rows.items()],
-            note="Shares are of all expected poses; every failed pose has one cause.",
+            note="Fractions are of all expected poses; every failed pose has one cause.",
             best="",
         ),
-        *[_object_causes(file, place) for place, file in enumerate(files)],
+        *[_object_causes(file, index) for index, file in enumerate(files)],
     ]
 
 
-def _object_causes(file: Mapping[str, Any], place: int) -> Table:
-    named = [(name if name == "total" else f"object {name}", counts) for name, counts in file["causes"].items()]
+def _object_causes(file: Mapping[str, Any], index: int) -> Table:
     return Table(
         title=f"Failures of {file['name']} by cause and object",
-        name=f"causes-objects-{place}",
-        columns=[Column(key="name", heading="object"), *CAUSE_COLUMNS],
-        rows=[Row(cells={"name": name} | _cause_cells(counts), total=name == "total") for name, counts in named],
+        name=f"causes-objects-{index}",
+        columns=[TableColumn(key="name", heading="object"), *CAUSE_COLUMNS],
+        rows=[
+            Row(cells={"name": _group_name(group)} | _cause_cells(counts), total=group == TOTAL)
+            for group, counts in file["causes"].items()
+        ],
         best="",
     )
 
 
 def _cause_cells(counts: Mapping[str, int]) -> dict[str, Cell]:
     expected = counts["expected"]
-    shares = {key: counts[key] / expected if expected else None for key in ("failed", *CAUSES)}
-    return {"expected": expected, **shares}
+    fractions = {key: counts[key] / expected if expected else None for key in ("failed", *CAUSES)}
+    return {"expected": expected, **fractions}
 
 
 def curve_tables(summary: Mapping[str, Any]) -> list[Table]:
-    """Shares and errors by level of perturbation, where there are such starts."""
+    """Fractions and errors by level of perturbation, for files with perturbed initial poses."""
     curves = {
         file["name"]: {
             kind: [{key: float("nan") if value is None else value for key, value in point.items()} for point in points]
@@ -299,25 +293,25 @@ def curve_tables(summary: Mapping[str, Any]) -> list[Table]:
 
 def _table(
     title: str,
-    name: str,
-    first: Column,
-    rows: Sequence[tuple[Mapping[str, str], Values, Values]],
-    columns: Sequence[Column],
+    slug: str,
+    first: TableColumn,
+    rows: Sequence[tuple[str, Values, Values]],
+    columns: Sequence[TableColumn],
     total_last: bool = False,
     note: str = "",
 ) -> Table:
-    """A table from names, scores and their intervals; columns without any value are left out."""
+    """A table with a row for each name, its scores and their intervals; columns without any value are left out."""
     kept = [column for column in columns if any(values.get(column.key) is not None for _, values, _ in rows)]
     described = [
         Row(
-            cells=dict(names) | {column.key: _cell(values, intervals, column.key) for column in kept},
-            total=total_last and place == len(rows) - 1,
+            cells={first.key: name} | {column.key: _cell(values, intervals, column.key) for column in kept},
+            total=total_last and index == len(rows) - 1,
         )
-        for place, (names, values, intervals) in enumerate(rows)
+        for index, (name, values, intervals) in enumerate(rows)
     ]
     columns = [first, *kept]
-    best: Best = "" if total_last else "column"  # objects are no competitors
-    return Table(title=title, name=name, columns=columns, rows=described, note=note, best=best)
+    best: Best = "" if total_last else "column"  # objects are not compared
+    return Table(title=title, name=slug, columns=columns, rows=described, note=note, best=best)
 
 
 def _cell(values: Values, intervals: Values, key: str) -> Cell:

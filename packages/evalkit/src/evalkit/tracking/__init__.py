@@ -1,30 +1,32 @@
-"""Tracking: how far a tracked pose stays from the truth along a sequence, how steady it is, and how often it is lost.
+"""Tracking: errors of a tracked pose along a sequence, jitter, and lost frames.
 
 The tables are those of section 4.2 (figure 5) of the 2018 paper, on the sequences of Choi and Christensen ("RGB-D
 Object Tracking: A Particle Filter Approach on GPU", IROS 2013): root mean squares of x, y, z in millimetres and of
 roll, pitch, yaw in degrees; and the success rate of the RBOT data set (Tjaden et al., "A Region-based Gauss-Newton
-Approach to Real-Time Monocular Multiple Object Tracking", TPAMI 2018): the share of frames within 5 cm and 5 degrees,
-where a tracker that fails is set back to the truth of that frame and goes on from there.
+Approach to Real-Time Monocular Multiple Object Tracking", TPAMI 2018): the fraction of frames within 5 cm and 5
+degrees, where a tracker that fails is reset to the ground truth of that frame.
 """
 
-from evalkit.tracking.reset_run import ResetRun, Tracker, run_with_resets
-from evalkit.tracking.residuals import Residuals, changes, euler_deg, legacy_angles_deg, residuals
+from evalkit.tracking.job import TrackingJob, make_tracking_table
+from evalkit.tracking.reset_run import ResetRun, ResettableTracker, run_with_resets
+from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.scores import TRACKING_DEFINITIONS, track_scores
 from evalkit.tracking.tables import TrackedFile, axis_table, named_tracks, sequence_table
-from evalkit.tracking.tracks import Track, frames_of, tracks_of
+from evalkit.tracking.tracks import ObjectTrack, frames_of, tracks_of
 
 __all__ = [
     "TRACKING_DEFINITIONS",
+    "ObjectTrack",
     "ResetRun",
+    "ResettableTracker",
     "Residuals",
-    "Track",
     "TrackedFile",
-    "Tracker",
+    "TrackingJob",
     "axis_table",
     "changes",
     "euler_deg",
     "frames_of",
-    "legacy_angles_deg",
+    "make_tracking_table",
     "named_tracks",
     "residuals",
     "run_with_resets",

@@ -1,6 +1,6 @@
-"""What is left between tracked and true poses, in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
+"""Residuals of tracked poses in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
 
-Objects with symmetries take it to the copy of the truth that lies nearest in rotation.
+For objects with symmetries, the residual is to the symmetry-equivalent ground truth nearest in rotation.
 """
 
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from posecore import se3
-from posecore.symmetry import Symmetric, align_ball, is_ball
+from posecore.symmetry import Symmetric, symmetric_copies
 
 Array = np.ndarray
 TIE_RAD = 1e-6
@@ -17,7 +17,7 @@ TIE_RAD = 1e-6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Residuals:
-    """What is left between estimates and truths, in camera axes; NaN where there is no estimate.
+    """Residuals of estimates in camera axes; NaN where there is no estimate.
 
     Attributes:
         R: (n, 3, 3) `R_est R_gt^-1`.
@@ -43,7 +43,7 @@ def residuals(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: S
 
     Args:
         T_est: estimates `T_cam_obj`, metres, NaN where there is none.
-        T_gt: truths.
+        T_gt: ground truth.
         info: symmetries of the object, None for none.
     """
     R, dt_m = _to_copies(T_est[:, :3, :3], T_est, T_gt, info)
@@ -69,66 +69,36 @@ def _nearest_copies(R: Float[Array, "n s 3 3"]) -> Int[Array, " n"]:
 def changes(
     T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """By how much the residual changes from each frame to the next (m = n - 1): metres and radians; NaN beside a gap.
+    """Change of the residual from each frame to the next (m = n - 1), metres and radians; NaN beside a gap.
 
-    The later frame's residual is to the copy of the truth that is nearest to the earlier frame's residual.
+    The later frame's residual is to the symmetry-equivalent ground truth nearest to the earlier frame's residual.
     """
-    found = residuals(T_est, T_gt, info)
-    before_R, before_t = found.R[:-1], found.dt_m[:-1]
+    errors = residuals(T_est, T_gt, info)
+    before_R, before_t = errors.R[:-1], errors.dt_m[:-1]
     back = np.swapaxes(before_R, -1, -2) @ T_est[1:, :3, :3]
     R, dt_m = _to_copies(back, T_est[1:], T_gt[1:], info)
-    turned = se3.rotation_angle_rad(R @ np.swapaxes(before_R, -1, -2)[:, None])
-    chosen = np.where(np.isnan(turned), np.inf, turned).argmin(axis=1)
+    angles_rad = se3.rotation_angle_rad(R @ np.swapaxes(before_R, -1, -2)[:, None])
+    chosen = np.where(np.isnan(angles_rad), np.inf, angles_rad).argmin(axis=1)
     rows = np.arange(len(chosen))
     moved = np.linalg.norm(dt_m[rows, chosen] - before_t, axis=1)
-    return np.asarray(moved), np.asarray(turned[rows, chosen])
+    return np.asarray(moved), np.asarray(angles_rad[rows, chosen])
 
 
 def _to_copies(
     R_near: Float[Array, "n 3 3"], T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
 ) -> tuple[Float[Array, "n s 3 3"], Float[Array, "n s 3"]]:
-    """Residuals to the copies of the truth: one for each discrete symmetry.
+    """Residuals to the symmetry-equivalent ground-truth poses: one for each discrete symmetry.
 
-    Where there is an axis of rotation, each copy is turned about it so that it comes as near as possible to `R_near`,
-    exactly: sampled turns would put their step into the residual and shake it from frame to frame.
+    With an axis of revolution, each is rotated about it to come nearest to `R_near`, exactly: sampled angles would put
+    their step into the residual and shake it from frame to frame.
     """
-    copies = T_gt[:, None] @ _symmetries(R_near, T_gt, info)
+    copies = symmetric_copies(T_gt, se3.make_T(R_near, np.zeros((len(R_near), 3))), info)
     R = T_est[:, None, :3, :3] @ np.swapaxes(copies[..., :3, :3], -1, -2)
     gone = np.isnan(R).any(axis=(-2, -1), keepdims=True)
     # Annotations are orthonormal to three digits only. A rotation times a stretch has that rotation as its nearest one,
-    # so transposing instead of inverting the truth costs nothing.
+    # so transposing instead of inverting the ground truth costs nothing.
     R = np.where(gone, np.nan, se3.nearest_rotation(np.where(gone, np.eye(3), R)))
     return np.asarray(R), np.asarray(T_est[:, None, :3, 3] - copies[..., :3, 3])
-
-
-def _symmetries(
-    R_near: Float[Array, "n 3 3"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
-) -> Float[Array, "n s 4 4"]:
-    fixed = np.stack([np.eye(4), *(info.symmetries_discrete if info is not None else ())])
-    fixed = np.broadcast_to(fixed, (len(T_gt), *fixed.shape))
-    axes = info.symmetries_continuous if info is not None else ()
-    if not axes:
-        return fixed
-    if is_ball(axes):
-        near = [align_ball(axes, truth, se3.make_T(R, np.zeros(3))) for truth, R in zip(T_gt, R_near, strict=True)]
-        return np.array(near).reshape(-1, 1, 4, 4)
-    turn = np.linalg.inv(T_gt[:, :3, :3])[:, None] @ R_near[:, None] @ np.swapaxes(fixed[..., :3, :3], -1, -2)
-    return np.asarray(_turns_nearest(turn, np.array(axes[0].axis), np.array(axes[0].offset_m)) @ fixed)
-
-
-def _turns_nearest(
-    M: Float[Array, "n s 3 3"], axis: Float[Array, "3"], offset_m: Float[Array, "3"]
-) -> Float[Array, "n s 4 4"]:
-    """The turn C about a line that brings `M C^T` nearest to the identity.
-
-    The trace of `M C^T` is a constant plus `cos * (trace M - a M a) + sin * (a . w)`, with w the vector of the skew
-    part of M: the angle of its largest value is an arc tangent.
-    """
-    skew = np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
-    along = np.einsum("i,...ij,j->...", axis, M, axis)
-    angle = np.arctan2(skew @ axis, np.trace(M, axis1=-2, axis2=-1) - along)
-    R = se3.rotation_from_rotvec(np.nan_to_num(angle)[..., None] * axis)
-    return se3.make_T(R, offset_m - R @ offset_m)
 
 
 def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
@@ -140,14 +110,3 @@ def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
     pitch = np.arctan2(-R[..., 2, 0], np.hypot(R[..., 2, 1], R[..., 2, 2]))
     yaw = np.arctan2(R[..., 1, 0], R[..., 0, 0])
     return np.asarray(np.rad2deg(np.stack([roll, pitch, yaw], axis=-1)))
-
-
-def legacy_angles_deg(R_est: Float[Array, "n 3 3"], R_gt: Float[Array, "n 3 3"]) -> Float[Array, "n 3"]:
-    """Differences of the unwrapped Euler angles of estimates and truths, degrees, as old tables have them.
-
-    Two rotations that are close can be far apart in these angles, where the pitch is near 90 degrees. The difference in
-    the first frame is brought within half a turn, so that 359 degrees against 1 is 2 degrees.
-    """
-    est, gt = (np.unwrap(euler_deg(se3.nearest_rotation(R)), period=360.0, axis=0) for R in (R_est, R_gt))
-    difference = est - gt
-    return np.asarray(difference - 360.0 * np.round(difference[:1] / 360.0))

@@ -5,41 +5,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from evalkit.inputs.result_files import ResultFile
+from evalkit.inputs.result_files import ResultFile, method_names
 from evalkit.scores.bootstrap import Units, resample
 from evalkit.scores.per_pose import Values
-from evalkit.tables.model import Cell, Column, Interval, Row, Table
-from evalkit.tables.paper_refinement import method_names
+from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 from evalkit.tracking.scores import ANGLES, AXES, track_scores
-from evalkit.tracking.tracks import Track
+from evalkit.tracking.tracks import ObjectTrack
 
 Array = np.ndarray
+
+
+def _rms_column(key: str, heading: str, unit: str, about: str = "") -> TableColumn:
+    return TableColumn(key=key, heading=heading, group="RMS", unit=unit, digits=2, better="lower", about=about)
+
+
 RMS_COLUMNS = (
-    *(
-        Column(
-            key=f"{axis}_rms_mm", heading=axis, group="RMS", unit="mm", digits=2, better="lower", about=f"camera {axis}"
-        )
-        for axis in AXES
-    ),
-    *(
-        Column(key=f"{name}_rms_deg", heading=name, group="RMS", unit="deg", digits=2, better="lower")
-        for name in ANGLES
-    ),
+    *(_rms_column(f"{axis}_rms_mm", axis, "mm", about=f"camera {axis}") for axis in AXES),
+    *(_rms_column(f"{name}_rms_deg", name, "deg") for name in ANGLES),
 )
 TRACK_COLUMNS = (
-    Column(key="frames", heading="frames", digits=0),
-    Column(key="lost", heading="lost", digits=0, better="lower", about="frames without an estimate"),
+    TableColumn(key="frames", heading="frames", digits=0),
+    TableColumn(key="lost", heading="lost", digits=0, better="lower", about="frames without an estimate"),
     *RMS_COLUMNS,
-    Column(key="success_5cm5deg", heading="5 cm 5°", unit="%", digits=1, better="higher"),
-    Column(key="failed", heading="failed", digits=0, about="frames outside of 5 cm or 5 degrees, lost ones too"),
-    Column(
-        key="resets", heading="resets", digits=0, about="how often the tracker was set to the truth after a failure"
-    ),
-    Column(key="jitter_mm_median", heading="median", group="jitter", unit="mm", digits=2, better="lower"),
-    Column(key="jitter_mm_p95", heading="95 %", group="jitter", unit="mm", digits=2, better="lower"),
-    Column(key="jitter_deg_median", heading="median", group="jitter", unit="deg", digits=2, better="lower"),
-    Column(key="jitter_deg_p95", heading="95 %", group="jitter", unit="deg", digits=2, better="lower"),
-    Column(key="time_ms_mean", heading="time", unit="ms", digits=1, better="lower", about="mean of a frame"),
+    TableColumn(key="success_5cm5deg", heading="5 cm 5°", unit="%", digits=1, better="higher"),
+    TableColumn(key="failed", heading="failed", digits=0, about="frames outside of 5 cm or 5 degrees, lost ones too"),
+    TableColumn(key="resets", heading="resets", digits=0, about="number of resets to the ground truth after a failure"),
+    TableColumn(key="jitter_mm_median", heading="median", group="jitter", unit="mm", digits=2, better="lower"),
+    TableColumn(key="jitter_mm_p95", heading="95 %", group="jitter", unit="mm", digits=2, better="lower"),
+    TableColumn(key="jitter_deg_median", heading="median", group="jitter", unit="deg", digits=2, better="lower"),
+    TableColumn(key="jitter_deg_p95", heading="95 %", group="jitter", unit="deg", digits=2, better="lower"),
+    TableColumn(key="time_ms_mean", heading="time", unit="ms", digits=1, better="lower", about="mean of a frame"),
 )
 SUMMED = ("frames", "lost", "failed", "resets")
 TOTAL = "mean of sequences"
@@ -47,30 +42,27 @@ TOTAL = "mean of sequences"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrackedFile:
-    """A result file's tracks under the name that readers know it by."""
+    """A result file's tracks under its name for readers."""
 
     name: str
-    tracks: list[Track]
+    tracks: list[ObjectTrack]
 
 
-def named_tracks(files: Sequence[ResultFile], tracks: Sequence[list[Track]]) -> list[TrackedFile]:
-    """Tracks of result files, named by what their sidecars say."""
+def named_tracks(files: Sequence[ResultFile], tracks: Sequence[list[ObjectTrack]]) -> list[TrackedFile]:
+    """Tracks of result files, named by their sidecars."""
     names = method_names(files)
-    return [TrackedFile(name=name, tracks=found) for name, found in zip(names, tracks, strict=True)]
+    return [TrackedFile(name=name, tracks=of_file) for name, of_file in zip(names, tracks, strict=True)]
 
 
-def sequence_table(
-    tracked: Sequence[TrackedFile], *, choi_legacy: bool = False, resamples: int = 0, seed: int = 0
-) -> Table:
+def sequence_table(tracked: Sequence[TrackedFile], *, resamples: int = 0, seed: int = 0) -> Table:
     """Every sequence, a row for each method, then the mean over sequences (counts summed).
 
     Args:
         tracked: see `named_tracks`.
-        choi_legacy: angles as in old tables, see `legacy_angles_deg`.
         resamples: for 95 % bootstrap intervals of the means, sequences resampled; 0 for none.
         seed: of the resampling.
     """
-    scored = [[track_scores(track, choi_legacy=choi_legacy) for track in item.tracks] for item in tracked]
+    scored = [[track_scores(track) for track in item.tracks] for item in tracked]
     rows: dict[str, list[Row]] = {}
     for item, scores in zip(tracked, scored, strict=True):
         for track, values in zip(item.tracks, scores, strict=True):
@@ -85,17 +77,17 @@ def sequence_table(
         for item, scores in zip(tracked, scored, strict=True)
         if len(scores) > 1
     ]
-    method = [Column(key="method", heading="method")] if len(tracked) > 1 else []
+    method = [TableColumn(key="method", heading="method")] if len(tracked) > 1 else []
     shown = {column.key for column in (*method, *TRACK_COLUMNS)} | {"sequence"}
     return Table(
         title="Tracking by sequence",
         name="tracking",
-        columns=[Column(key="sequence", heading="sequence"), *method, *TRACK_COLUMNS],
+        columns=[TableColumn(key="sequence", heading="sequence"), *method, *TRACK_COLUMNS],
         rows=[
             Row(cells={key: cell for key, cell in row.cells.items() if key in shown}, group=row.group, total=row.total)
             for row in [*(row for part in rows.values() for row in part), *totals]
         ],
-        note=_note(tracked, choi_legacy),
+        note=_note(tracked),
         best="column" if method else "",
     )
 
@@ -105,59 +97,58 @@ def _totals(scores: Sequence[Mapping[str, float]], resamples: int, seed: int) ->
     resampling = resample(units, resamples, seed) if resamples else None
     totals: dict[str, Cell] = {}
     for key in (column.key for column in TRACK_COLUMNS):
-        values = np.array([found[key] for found in scores])
-        known = values[~np.isnan(values)]
+        values = np.array([of_track[key] for of_track in scores])
+        valid = values[~np.isnan(values)]
         if key in SUMMED:
-            totals[key] = float(known.sum()) if len(known) else None
+            totals[key] = float(valid.sum()) if len(valid) else None
             continue
         ends = None if resampling is None else resampling.interval(Values(per_row=values, statistic="mean"))
-        mean = float(known.mean()) if len(known) else float("nan")
+        mean = float(valid.mean()) if len(valid) else float("nan")
         totals[key] = mean if ends is None else Interval(value=mean, low=ends[0], high=ends[1])
     return totals
 
 
-def _note(tracked: Sequence[TrackedFile], choi_legacy: bool) -> str:
+def _note(tracked: Sequence[TrackedFile]) -> str:
     parts = ["RMS over frames with an estimate; lost frames fail 5 cm 5°."]
-    if choi_legacy:
-        parts.append("Roll, pitch, yaw: differences of unwrapped Euler angles, symmetries left out (Choi legacy).")
-    free = [item.name for item in tracked if all(track.given is None for track in item.tracks)]
+    free = [item.name for item in tracked if all(track.was_initialised is None for track in item.tracks)]
     if free:
         names = "" if len(tracked) == 1 else f" of {', '.join(free)}"
         parts.append(
             f"5 cm 5°{names}: without resets, frames as they are; a tracker that is lost stays lost, so this is not "
-            "RBOT's number, for which a tracker is set to the truth after a failure (`resets` in the sidecar)."
+            "RBOT's number, for which a tracker is reset to the ground truth after a failure (`resets` in the sidecar)."
         )
     for item in tracked:
-        left = sum(_failed_without_reset(track) for track in item.tracks)
-        if left:
-            parts.append(f"{item.name}: {left} failed frames without a reset, so RBOT's protocol was not kept.")
+        unreset = sum(_failed_without_reset(track) for track in item.tracks)
+        if unreset:
+            parts.append(f"{item.name}: {unreset} failed frames without a reset, so RBOT's protocol was not kept.")
     return " ".join(parts)
 
 
-def _failed_without_reset(track: Track) -> int:
+def _failed_without_reset(track: ObjectTrack) -> int:
     scores = track_scores(track)
-    return 0 if track.given is None else int(scores["failed"] - scores["resets"])
+    return 0 if track.was_initialised is None else int(scores["failed"] - scores["resets"])
 
 
-def axis_table(tracked: Sequence[TrackedFile], *, choi_legacy: bool = False) -> Table:
+def axis_table(tracked: Sequence[TrackedFile]) -> Table:
     """The layout of the paper's figure 5a: six rows for each sequence, a column for each method, the best bold."""
-    found: dict[str, dict[int, dict[str, float]]] = {}
-    for place, item in enumerate(tracked):
+    scores_by_track: dict[str, dict[int, dict[str, float]]] = {}
+    for index, item in enumerate(tracked):
         for track in item.tracks:
-            found.setdefault(track.name, {})[place] = track_scores(track, choi_legacy=choi_legacy)
+            scores_by_track.setdefault(track.name, {})[index] = track_scores(track)
     rows = []
-    for name, by_method in found.items():
+    for name, by_method in scores_by_track.items():
         for shown in RMS_COLUMNS:
-            cells: dict[str, Cell] = {f"rms_{place}": values[shown.key] for place, values in by_method.items()}
+            cells: dict[str, Cell] = {f"rms_{index}": values[shown.key] for index, values in by_method.items()}
             rows.append(Row(cells=cells | {"sequence": name, "axis": shown.title}, group=name))
     columns = [
-        Column(key=f"rms_{place}", heading=item.name, digits=2, better="lower") for place, item in enumerate(tracked)
+        TableColumn(key=f"rms_{index}", heading=item.name, digits=2, better="lower")
+        for index, item in enumerate(tracked)
     ]
     return Table(
         title="Tracking, RMS by axis",
         name="tracking-axes",
-        columns=[Column(key="sequence", heading="sequence"), Column(key="axis", heading="RMS"), *columns],
+        columns=[TableColumn(key="sequence", heading="sequence"), TableColumn(key="axis", heading="RMS"), *columns],
         rows=rows,
-        note=_note(tracked, choi_legacy),
+        note=_note(tracked),
         best="row",
     )

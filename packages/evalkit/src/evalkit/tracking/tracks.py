@@ -1,4 +1,4 @@
-"""Sequences of a result file: one object along one scene, and the frames in which its tracker was set to the truth."""
+"""Sequences of a result file: an object along a scene, and the frames in which its tracker was initialised."""
 
 from collections import Counter, defaultdict
 from collections.abc import Sequence
@@ -12,27 +12,27 @@ from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
 
-from evalkit.inputs.pairing import truths_of
+from evalkit.inputs.pairing import instances_of
 from evalkit.inputs.result_files import ResultFile
 
 Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Track:
+class ObjectTrack:
     """One object along one sequence, frames in order.
 
     Attributes:
         scene_id: sequence.
         obj_id: object.
-        instance: which of several alike, counted from 0 in the order of the images' lists.
+        instance: number among several instances of the object, from 0, in order of the images' annotations.
         name: for tables.
         im_id: (n,) images.
-        frame: (n,) their places in the sequence: neighbours differ by 1.
+        frame: (n,) indices of the images in the sequence: neighbours differ by 1.
         T_est: (n, 4, 4) estimates, metres, NaN where there is none.
-        T_gt: (n, 4, 4) truths.
+        T_gt: (n, 4, 4) ground truth.
         time_s: (n,) run times, NaN or negative where unknown.
-        given: (n,) frames in which the tracker was set to the truth, None for a run without resets.
+        was_initialised: (n,) frames in which the tracker was set to the ground truth, None for a run without resets.
         info: symmetries.
     """
 
@@ -45,7 +45,7 @@ class Track:
     T_est: Float[Array, "n 4 4"]
     T_gt: Float[Array, "n 4 4"]
     time_s: Float[Array, " n"]
-    given: Bool[Array, " n"] | None
+    was_initialised: Bool[Array, " n"] | None
     info: Symmetric | None
 
 
@@ -55,21 +55,21 @@ def tracks_of(
     table: pd.DataFrame,
     T_est: Float[Array, "n 4 4"],
     T_gt: Float[Array, "n 4 4"],
-) -> list[Track]:
+) -> list[ObjectTrack]:
     """The sequences of a result file: one track for each object of each scene.
 
     Args:
         dataset: with ground truth; the images of a scene are its frames, in rising order.
         file: where its sidecar has `resets`, a list of `{"scene_id": .., "im_id": .., "obj_id": ..}` (and `"instance"`
-            for one of several alike), these are the frames in which the tracker was set to the truth: the first frame
-            of a sequence and, under RBOT's protocol, every frame that failed. What the file holds for such a frame is
-            not scored.
+            for one of several instances), these are the frames in which the tracker was set to the ground truth: the
+            first frame of a sequence and, under RBOT's protocol, every failed frame. The file's poses of these frames
+            are not scored.
         table: `scene_id`, `im_id`, `obj_id`, `gt_index` and `time_s`, one row for each expected pose.
         T_est: (n, 4, 4) estimates, metres, NaN where missing.
-        T_gt: (n, 4, 4) truths.
+        T_gt: (n, 4, 4) ground truth.
 
     Raises:
-        ResultFileError: several poses of an instance in an image, as perturbed starts have, or broken `resets`.
+        ResultFileError: several poses of an instance in an image, as perturbed initial poses have, or broken `resets`.
     """
     resets = _resets(file, dataset)
     keys = table[["scene_id", "obj_id"]].copy()
@@ -80,21 +80,18 @@ def tracks_of(
     several = set(map(tuple, keys.loc[keys.instance > 0, ["scene_id", "obj_id"]].to_numpy().tolist()))
     im_id, time_s = table.im_id.to_numpy(np.int64), table.time_s.to_numpy(np.float64)
     tracks = []
-    for (scene_id, obj_id, instance), places in keys.groupby(list(keys.columns), sort=True).indices.items():
-        rows = places[np.argsort(im_id[places], kind="stable")]
+    for (scene_id, obj_id, instance), indices in keys.groupby(list(keys.columns), sort=True).indices.items():
+        rows = indices[np.argsort(im_id[indices], kind="stable")]
         images = im_id[rows]
         if (np.diff(images) == 0).any():
             twice = int(images[:-1][np.diff(images) == 0][0])
             raise ResultFileError(
-                f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of one instance; "
-                "a tracked sequence has one (perturbed starts belong into `evalkit report`)"
+                f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of the object; "
+                "a tracked sequence has one (perturbed initial poses are for `evalkit report`)"
             )
         mark = f", instance {instance + 1}" if (scene_id, obj_id) in several else ""
-        given = None
-        if resets is not None:
-            given = np.array([(scene_id, image, obj_id, instance) in resets for image in images.tolist()], bool)
         tracks.append(
-            Track(
+            ObjectTrack(
                 scene_id=int(scene_id),
                 obj_id=int(obj_id),
                 instance=int(instance),
@@ -104,17 +101,25 @@ def tracks_of(
                 T_est=T_est[rows],
                 T_gt=T_gt[rows],
                 time_s=time_s[rows],
-                given=given,
+                was_initialised=_were_initialised(resets, images, int(scene_id), int(obj_id), int(instance)),
                 info=dataset.models_info[int(obj_id)],
             )
         )
     return tracks
 
 
+def _were_initialised(
+    resets: set[tuple[int, int, int, int]] | None, im_id: Int[Array, " n"], scene_id: int, obj_id: int, instance: int
+) -> Bool[Array, " n"] | None:
+    if resets is None:
+        return None
+    return np.array([(scene_id, image, obj_id, instance) in resets for image in im_id.tolist()], bool)
+
+
 def frames_of(
     dataset: BopDataset, file: ResultFile, *, all_frames: bool = False
 ) -> tuple[pd.DataFrame, Float[Array, "n 4 4"], Float[Array, "n 4 4"]]:
-    """Every pose that a tracker is expected to find, with its estimate: what `tracks_of` takes.
+    """Every expected pose with its estimate, as arguments of `tracks_of`.
 
     Of the estimates of an object in an image those with the highest scores count, as many as there are instances; they
     go to the instances so that distances of the origins add up to the least.
@@ -122,11 +127,11 @@ def frames_of(
     Args:
         dataset: with ground truth.
         file: with estimates.
-        all_frames: every pose that is annotated in scenes that the targets name, instead of the targets only: targets
-            may leave out frames of a video, or poses that are hardly visible.
+        all_frames: every annotated pose in the targets' scenes, not only the targets, which may leave out frames of a
+            video or poses that are hardly visible.
 
     Returns:
-        Table with `scene_id`, `im_id`, `obj_id`, `gt_index`, `time_s`; estimates, NaN where missing; truths.
+        Table with `scene_id`, `im_id`, `obj_id`, `gt_index`, `time_s`; estimates, NaN where missing; ground truth.
     """
     estimates: dict[tuple[int, int, int], list[Estimate]] = defaultdict(list)
     for estimate in file.estimates:
@@ -134,14 +139,14 @@ def frames_of(
     rows, T_est, T_gt = [], [], []
     for target in _every_pose(dataset) if all_frames else dataset.targets:
         key = (target.scene_id, target.im_id, target.obj_id)
-        truths = sorted(truths_of(dataset, target)[: target.inst_count], key=lambda gt: gt.gt_index)
-        best = sorted(estimates[key], key=lambda estimate: -estimate.score)[: len(truths)]
-        matched = _matched(best, truths)
-        for place, truth in enumerate(truths):
-            found = matched.get(place)
-            rows.append((*key, truth.gt_index, np.nan if found is None else found.time_s))
-            T_est.append(np.full((4, 4), np.nan) if found is None else found.T_cam_obj)
-            T_gt.append(truth.T_cam_obj)
+        instances = sorted(instances_of(dataset, target)[: target.inst_count], key=lambda gt: gt.gt_index)
+        best = sorted(estimates[key], key=lambda estimate: -estimate.score)[: len(instances)]
+        matched = _matched(best, instances)
+        for index, gt in enumerate(instances):
+            of_instance = matched.get(index)
+            rows.append((*key, gt.gt_index, np.nan if of_instance is None else of_instance.time_s))
+            T_est.append(np.full((4, 4), np.nan) if of_instance is None else of_instance.T_cam_obj)
+            T_gt.append(gt.T_cam_obj)
     table = pd.DataFrame(rows, columns=["scene_id", "im_id", "obj_id", "gt_index", "time_s"])
     return table, np.array(T_est).reshape(-1, 4, 4), np.array(T_gt).reshape(-1, 4, 4)
 
@@ -157,13 +162,13 @@ def _every_pose(dataset: BopDataset) -> list[BopTarget]:
     return targets
 
 
-def _matched(estimates: Sequence[Estimate], truths: Sequence[GroundTruth]) -> dict[int, Estimate]:
-    """Estimate of each truth by its place."""
-    if len(truths) == 1:
+def _matched(estimates: Sequence[Estimate], instances: Sequence[GroundTruth]) -> dict[int, Estimate]:
+    """Estimate of each instance by its index."""
+    if len(instances) == 1:
         return dict(enumerate(estimates))
-    distance = [[np.linalg.norm(e.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3]) for gt in truths] for e in estimates]
-    which, places = linear_sum_assignment(np.array(distance).reshape(len(estimates), len(truths)))
-    return {int(place): estimates[int(number)] for number, place in zip(which, places, strict=True)}
+    distance = [[np.linalg.norm(e.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3]) for gt in instances] for e in estimates]
+    which, indices = linear_sum_assignment(np.array(distance).reshape(len(estimates), len(instances)))
+    return {int(index): estimates[int(number)] for number, index in zip(which, indices, strict=True)}
 
 
 def _instance(dataset: BopDataset, scene_id: int, im_id: int, obj_id: int, gt_index: int) -> int:
@@ -171,7 +176,7 @@ def _instance(dataset: BopDataset, scene_id: int, im_id: int, obj_id: int, gt_in
 
 
 def _resets(file: ResultFile, dataset: BopDataset) -> set[tuple[int, int, int, int]] | None:
-    """Scene, image, object and instance of the frames in which the tracker was set to the truth."""
+    """Scene, image, object and instance of the frames in which the tracker was initialised."""
     listed = file.sidecar.get("resets")
     if listed is None:
         return None

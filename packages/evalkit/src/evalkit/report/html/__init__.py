@@ -1,9 +1,9 @@
-"""The report's page: one file, light, readable from 360 px to wide screens, nothing loaded from elsewhere."""
+"""The report's page: one file without external resources, readable from 360 px to wide screens."""
 
 from evalkit.report.html.document import page
 from evalkit.report.html.elements import (
+    Picture,
     Section,
-    Shot,
     beside,
     case,
     cases,
@@ -17,8 +17,8 @@ from evalkit.report.html.elements import (
 from evalkit.report.html.table import table
 
 __all__ = [
+    "Picture",
     "Section",
-    "Shot",
     "beside",
     "case",
     "cases",

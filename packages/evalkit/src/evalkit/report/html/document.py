@@ -1,4 +1,4 @@
-"""A whole page in one file: style and script are written into it."""
+"""A whole page in one file, with style and script inside."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -14,7 +14,7 @@ def _asset(name: str) -> str:
 
 
 def page(title: str, head: str, sections: Sequence[Section]) -> str:
-    """A document: the title, what stands below it, a table of contents, the sections that have something to show.
+    """A document: title, head, table of contents, and the sections that are not empty.
 
     Args:
         title: plain text.

@@ -6,8 +6,8 @@ from html import escape
 
 
 @dataclass(frozen=True, kw_only=True)
-class Shot:
-    """One picture of a case: which result file, the image as a data URL, and a line below it."""
+class Picture:
+    """One picture of a case: name of the result file, image as a data URL, caption."""
 
     name: str
     url: str
@@ -23,34 +23,34 @@ class Section:
 
     @property
     def is_empty(self) -> bool:
-        """Whether it has nothing to show."""
+        """Whether the section has no content."""
         return not any(self.parts)
 
     @property
     def anchor(self) -> str:
-        """Its place in the page, unique as headings are."""
+        """Fragment identifier in the page, unique as headings are."""
         return "".join(char if char.isalnum() else "-" for char in self.heading.lower())
 
 
-def case(title: str, shots: Sequence[Shot]) -> str:
-    """The same pose as several result files have it, side by side."""
+def case(title: str, pictures: Sequence[Picture]) -> str:
+    """One pose in several result files, side by side."""
     figures = "".join(
-        f'<figure><img src="{shot.url}" alt="{escape(title)}: {escape(shot.name)}, {escape(shot.caption)}" '
+        f'<figure><img src="{picture.url}" alt="{escape(title)}: {escape(picture.name)}, {escape(picture.caption)}" '
         'width="300" height="300" decoding="async">'
-        f"<figcaption><b>{escape(shot.name)}</b><br>{escape(shot.caption)}</figcaption></figure>"
-        for shot in shots
+        f"<figcaption><b>{escape(picture.name)}</b><br>{escape(picture.caption)}</figcaption></figure>"
+        for picture in pictures
     )
     return f'<article class="case"><h3>{escape(title)}</h3><div class="shots">{figures}</div></article>'
 
 
-def cases(articles: Sequence[str], shots_each: int) -> str:
+def cases(articles: Sequence[str], pictures_each: int) -> str:
     """A grid of cases, each wide enough for its pictures."""
-    width = 20 + 190 * max(1, min(shots_each, 4))
+    width = 20 + 190 * max(1, min(pictures_each, 4))
     return f'<div class="cases" style="--case: {width}px">{"".join(articles)}</div>'
 
 
 def definitions(entries: Mapping[str, str]) -> str:
-    """Terms and what they mean."""
+    """Terms and their definitions."""
     items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries.items())
     return f"<dl>{items}</dl>" if items else ""
 
@@ -76,7 +76,7 @@ def items(texts: Sequence[str]) -> str:
 
 
 def fold(label: str, *parts: str) -> str:
-    """Parts that are shown on demand, and on paper."""
+    """Parts shown on demand and in print."""
     content = "".join(parts)
     return f"<details><summary>{escape(label)}</summary>{content}</details>" if content else ""
 

@@ -2,7 +2,7 @@
 
 from html import escape
 
-from evalkit.tables.model import Column, Row, Table, best_cells, cell_text, column_groups, number_of
+from evalkit.tables.model import Row, Table, TableColumn, best_cells, cell_text, column_groups, number_of
 
 ALARMS = ("missing",)
 """Columns whose values other than 0 are set in red."""
@@ -28,7 +28,7 @@ def _heads(described: Table) -> str:
     titles: list[str] = []
     for group, span in column_groups(columns):
         members = columns[first : first + span]
-        # A unit that a whole group has is said once, above it.
+        # A unit common to a whole group stands once, in the group's heading.
         common = members[0].unit if group and len({column.unit for column in members}) == 1 else ""
         titles += [column.heading if common else column.title for column in members]
         scope = f' scope="colgroup"{_classes("opens" if opens[first] else "")}' if group else ""
@@ -52,7 +52,7 @@ def _bodies(described: Table) -> str:
     for index, row in enumerate(described.rows):
         if not blocks or blocks[-1][0] != (row.group, row.total):
             blocks.append(((row.group, row.total), []))
-        blocks[-1][1].append(_row(described, row, {key for place, key in best if place == index}))
+        blocks[-1][1].append(_row(described, row, {key for row_index, key in best if row_index == index}))
     return "".join(f"<tbody{_classes('total' if total else '')}>{''.join(rows)}</tbody>" for (_, total), rows in blocks)
 
 
@@ -66,7 +66,7 @@ def _row(described: Table, row: Row, best: set[str]) -> str:
             cells.append(f'<th scope="row" class="text" title="{escape(text)}">{escape(text)}</th>')
             continue
         number = number_of(cell)
-        # With an interval the cell's text is no longer a number.
+        # With an interval the cell's text is no number, so sorting needs the value.
         value = f' data-value="{number:.9g}"' if ends and not is_text and number is not None else ""
         marks = _classes(
             "text" if is_text else "",
@@ -81,7 +81,7 @@ def _row(described: Table, row: Row, best: set[str]) -> str:
 
 
 def _opens(described: Table) -> list[bool]:
-    """Whether a line stands before a column: where a new group of columns begins."""
+    """Whether a column begins a new group and has a line before it."""
     columns = described.columns
     return [index > 0 and column.group != columns[index - 1].group for index, column in enumerate(columns)]
 
@@ -91,5 +91,5 @@ def _classes(*names: str) -> str:
     return f' class="{kept}"' if kept else ""
 
 
-def _tooltip(column: Column) -> str:
+def _tooltip(column: TableColumn) -> str:
     return f' title="{escape(column.about)}"' if column.about else ""

@@ -1,4 +1,4 @@
-"""A report's page from scores and pictures: words, tables, plots, worst cases, definitions, inputs."""
+"""A report's page from scores and pictures: summary, tables, plots, worst cases, definitions, inputs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -18,21 +18,21 @@ def report_page(evaluator: Evaluator, scored: Sequence[Scored], summary: Mapping
     """The HTML document.
 
     Args:
-        evaluator: that scored the files; it renders the contours.
+        evaluator: of the files; it renders the contours.
         scored: result files in the summary's order.
         summary: of `evalkit.report.summary.summarise`.
-        worst: how many of the worst cases are shown as pictures.
+        worst: number of worst cases shown as pictures.
     """
-    looks = svg_plots.looks([item.file.is_start for item in scored])
-    key = svg_plots.legend([item.file.name for item in scored], looks)
+    styles = svg_plots.line_styles([item.file.is_initial for item in scored])
+    key = svg_plots.legend([item.file.name for item in scored], styles)
     sections = [
         Section(heading="Summary", parts=summary_text.summary(summary)),
         Section(heading="Totals", parts=[*map(html.table, total_tables(summary)), *_ignored(summary)]),
         Section(heading="By object", parts=_objects(summary)),
-        Section(heading="Recall curves", parts=[key, recall_curves.figures(scored, looks)]),
-        Section(heading="By visibility, distance and viewpoint", parts=_keyed(key, bins.parts(summary, looks))),
+        Section(heading="Recall curves", parts=[key, recall_curves.figures(scored, styles)]),
+        Section(heading="By visibility, distance and viewpoint", parts=_keyed(key, bins.parts(summary, styles))),
         Section(heading="Failures", parts=failures.parts(summary)),
-        Section(heading="From perturbed starts", parts=_keyed(key, convergence.parts(summary, looks))),
+        Section(heading="From perturbed initial poses", parts=_keyed(key, convergence.parts(summary, styles))),
         Section(heading="Worst cases", parts=cases.worst(evaluator, scored, worst)),
         Section(heading="Missing estimates", parts=cases.missing(scored)),
         Section(heading="Definitions", parts=[html.definitions(summary["definitions"])]),

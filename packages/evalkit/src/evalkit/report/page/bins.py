@@ -1,4 +1,4 @@
-"""What errors depend on: visibility, distance and viewpoint."""
+"""Scores by visibility, distance and viewpoint."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from evalkit.report import html, svg_plots
-from evalkit.report.svg_plots import Look, Series
+from evalkit.report.svg_plots import LineStyle, Series
 from evalkit.scores.bins import AZIMUTH_EDGES_DEG, ELEVATION_EDGES_DEG
 from evalkit.tables.report_tables import BIN_AXES, bin_tables
 
@@ -19,13 +19,13 @@ Record = Mapping[str, Any]
 class _Score:
     title: str
     y_label: str
-    is_share: bool = False
+    is_fraction: bool = False
     y_high: float | None = None
 
 
 SCORES = {
     "vss_mean": _Score(title="Mean VSS", y_label="mean VSS", y_high=1.0),
-    "add_s_recall_0.1d": _Score(title="ADD(-S) recall at 0.1 diameter", y_label="share of poses", is_share=True),
+    "add_s_recall_0.1d": _Score(title="ADD(-S) recall at 0.1 diameter", y_label="fraction of poses", is_fraction=True),
     "re_sym_deg_median": _Score(title="Median rotation error", y_label="degrees"),
     "tz_mm_median": _Score(title="Median z error", y_label="mm"),
 }
@@ -35,17 +35,17 @@ SHOWN = {
     "azimuth": ("vss_mean",),
     "elevation": ("vss_mean",),
 }
-"""Scores that are plotted along each axis; the tables have all of them."""
+"""Scores plotted along each axis; the tables have all scores."""
 NOTE = "Whiskers are 95 % intervals. Bins without poses are left out; the numbers and counts are below the plots."
 
 
-def parts(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
+def parts(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
     """Plots and tables; nothing where no pose has a value."""
     figures = []
     for axis, keys in SHOWN.items():
         drawn = [
-            (file["name"], look, file["bins"][axis])
-            for file, look in zip(summary["files"], looks, strict=True)
+            (file["name"], style, file["bins"][axis])
+            for file, style in zip(summary["files"], styles, strict=True)
             if file["bins"][axis]
         ]
         figures += [_plot(axis, key, drawn) for key in keys if drawn]
@@ -60,20 +60,20 @@ def parts(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
     ]
 
 
-def _plot(axis: str, key: str, drawn: Sequence[tuple[str, Look, Sequence[Record]]]) -> str:
+def _plot(axis: str, key: str, drawn: Sequence[tuple[str, LineStyle, Sequence[Record]]]) -> str:
     label, column, factor = BIN_AXES[axis]
     score = SCORES[key]
     lines = []
-    for place, (name, look, records) in enumerate(drawn):
+    for index, (name, style, records) in enumerate(drawn):
         kept = [record for record in records if record["score"] == key]
         low, high, value, lower, upper = (
             np.array([np.nan if record[name] is None else record[name] for record in kept], np.float64)
             for name in (f"{column}_low", f"{column}_high", "value", "low", "high")
         )
         # Side by side within a bin, so that whiskers do not hide each other.
-        aside = (place - (len(drawn) - 1) / 2) * min(0.08, 0.6 / len(drawn)) * (high - low)
+        aside = (index - (len(drawn) - 1) / 2) * min(0.08, 0.6 / len(drawn)) * (high - low)
         x = factor * ((low + high) / 2 + aside)
-        lines.append(Series(name=name, look=look, x=x, y=value, low=lower, high=upper, is_measured=True))
+        lines.append(Series(name=name, style=style, x=x, y=value, low=lower, high=upper, is_measured=True))
     ends = [
         factor * record[f"{column}_{end}"] for _, _, records in drawn for record in records for end in ("low", "high")
     ]
@@ -82,7 +82,7 @@ def _plot(axis: str, key: str, drawn: Sequence[tuple[str, Look, Sequence[Record]
         label,
         score.y_label,
         lines,
-        share=score.is_share,
+        is_fraction=score.is_fraction,
         y_high=score.y_high,
         x_ends=(min(ends), max(ends)),
         x_ticks=_ticks(ends),
@@ -132,12 +132,12 @@ def _viewpoint_map(name: str, records: Sequence[Record]) -> str:
     ]
     width = MAP_LEFT + CELL_W * len(azimuths) + 24
     drawn.append(_text((MAP_LEFT + width - 24) / 2, bottom + 38, "azimuth; at the left elevation", "middle"))
-    said = "; ".join(
+    description = "; ".join(
         f"azimuth {record['view_azimuth_deg_low']:g} to {record['view_azimuth_deg_high']:g}, elevation "
         f"{record['view_elevation_deg_low']:g} to {record['view_elevation_deg_high']:g}: {record['value']:.2f}"
         for record in records
     )
-    return svg_plots.figure(f"Mean VSS by viewpoint, {name}", said, "".join(drawn), bottom + 46, width)
+    return svg_plots.figure(f"Mean VSS by viewpoint, {name}", description, "".join(drawn), bottom + 46, width)
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:

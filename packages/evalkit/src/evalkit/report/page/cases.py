@@ -1,4 +1,4 @@
-"""Single poses as pictures, and the poses that nobody estimated."""
+"""Pictures of single poses, and lists of missing poses."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,16 +8,16 @@ import numpy as np
 from evalkit.evaluation.evaluator import Evaluator
 from evalkit.evaluation.scored_file import CaseKey, Scored
 from evalkit.report import html, pictures
-from evalkit.report.html import Shot
+from evalkit.report.html import Picture
 from evalkit.report.summary import worst_cases
 
 MISSING_LISTED = 20
 PICTURES_BYTES = 20_000_000
-"""Pictures of one page, so that it still opens quickly."""
+"""Limit for a page's pictures, so that the page opens quickly."""
 
 
 def worst(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[str]:
-    """The lowest VSS of the last result file, and what the other files made of the same poses."""
+    """The poses with the lowest VSS in the last result file, and the same poses in the other files."""
     keys = worst_cases(scored, count)
     lookups = [item.cases() for item in scored]
     articles: list[str] = []
@@ -37,8 +37,8 @@ def worst(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[st
 
 
 def legend() -> str:
-    """Which contour is which."""
-    green, pink = ("#{:02x}{:02x}{:02x}".format(*colour) for colour in (pictures.TRUTH_RGB, pictures.ESTIMATE_RGB))
+    """Legend of the contours."""
+    green, pink = ("#{:02x}{:02x}{:02x}".format(*colour) for colour in (pictures.GT_RGB, pictures.ESTIMATE_RGB))
     entries = "".join(
         f'<li><svg viewBox="0 0 38 14" aria-hidden="true"><path d="M1 7H37" stroke="#141414" stroke-width="6"/>'
         f'<path d="M1 7H37" stroke="{colour}" stroke-width="4"{dash}/></svg>{text}</li>'
@@ -51,7 +51,7 @@ def legend() -> str:
 
 
 def case(evaluator: Evaluator, scored: Sequence[Scored], lookups: Sequence[Mapping[CaseKey, int]], key: CaseKey) -> str:
-    """One pose as every result file that has it sees it; empty where the dataset has no image.
+    """One pose in every result file that has it; empty where the dataset has no image.
 
     Args:
         evaluator: of the dataset.
@@ -64,22 +64,22 @@ def case(evaluator: Evaluator, scored: Sequence[Scored], lookups: Sequence[Mappi
     present = [(item, lookup[key]) for item, lookup in zip(scored, lookups, strict=True) if key in lookup]
     if rgb is None or not present:
         return ""
-    first, place = present[0]
-    row, T_gt = first.table.iloc[place], first.T_gt[place]
+    first, first_row = present[0]
+    row, T_gt = first.table.iloc[first_row], first.T_gt[first_row]
     obj_id = int(row.obj_id)
     poses = [item.T_est[index] if item.table.found.iloc[index] else None for item, index in present]
     camera = evaluator.camera(scene_id, im_id)
     window = pictures.common_window(evaluator, obj_id, camera, T_gt, [T_est for T_est in poses if T_est is not None])
-    shots = []
+    shown = []
     for (item, index), T_est in zip(present, poses, strict=True):
         image = pictures.overlay(evaluator, rgb, camera, window, obj_id, T_gt, T_est)
         caption = _caption(item.table.iloc[index])
-        shots.append(Shot(name=item.file.name, url=pictures.data_url(image), caption=caption))
+        shown.append(Picture(name=item.file.name, url=pictures.data_url(image), caption=caption))
     visible = "" if np.isnan(row.visib_fract) else f", {100 * row.visib_fract:.0f}% visible"
     level = ""
-    if np.isfinite(row.start_angle_deg):
-        level = f", start {row.start_angle_deg:g}° and {row.start_translation_diameter:g} d off"
-    return html.case(f"Scene {scene_id}, image {im_id}, object {obj_id}{visible}{level}", shots)
+    if np.isfinite(row.initial_angle_deg):
+        level = f", initial pose {row.initial_angle_deg:g}° and {row.initial_translation_diameter:g} d off"
+    return html.case(f"Scene {scene_id}, image {im_id}, object {obj_id}{visible}{level}", shown)
 
 
 def _caption(row: Any) -> str:
@@ -90,7 +90,7 @@ def _caption(row: Any) -> str:
 
 
 def missing(scored: Sequence[Scored]) -> list[str]:
-    """Which poses each file has no estimate of."""
+    """Expected poses without an estimate, for each file."""
     shown = []
     for item in scored:
         rows = item.table[~item.table.found]

@@ -1,4 +1,4 @@
-"""Convergence from starts that were perturbed by steps: curves and tables."""
+"""Convergence from initial poses perturbed by steps: curves and tables."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from evalkit.report import html, svg_plots
-from evalkit.report.svg_plots import Look, Series
+from evalkit.report.svg_plots import LineStyle, Series
 from evalkit.tables.report_tables import curve_tables
 
 LEVEL_PLOTS = (
@@ -19,39 +19,41 @@ LEVEL_PLOTS = (
     ("Mean final rotation error, deg", "re_sym_deg_mean", False),
     ("Mean final translation error, mm", "te_mm_mean", False),
 )
-LEVEL_LABELS = {"angle": "start rotated by, degrees", "translation": "start moved by, diameters"}
+LEVEL_LABELS = {"angle": "initial pose rotated by, degrees", "translation": "initial pose translated by, diameters"}
 
 
-def parts(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
-    """Plots and tables; nothing where no start was perturbed by steps."""
-    return [*_plots(summary, looks), *map(html.table, curve_tables(summary))]
+def parts(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
+    """Plots and tables; nothing without initial poses perturbed by steps."""
+    return [*_plots(summary, styles), *map(html.table, curve_tables(summary))]
 
 
-def _plots(summary: Mapping[str, Any], looks: Sequence[Look]) -> list[str]:
+def _plots(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
     shown = []
     for kind, label in LEVEL_LABELS.items():
-        drawn = [(file, look) for file, look in zip(summary["files"], looks, strict=True) if kind in file["by_level"]]
+        drawn = [
+            (file, style) for file, style in zip(summary["files"], styles, strict=True) if kind in file["by_level"]
+        ]
         if not drawn:
             continue
         figures = [
             svg_plots.line_plot(
                 title,
                 label,
-                "share of poses" if share else title.rsplit(", ", 1)[-1],
-                [_series(file["name"], look, file["by_level"][kind], key) for file, look in drawn],
-                share=share,
+                "fraction of poses" if is_fraction else title.rsplit(", ", 1)[-1],
+                [_series(file["name"], style, file["by_level"][kind], key) for file, style in drawn],
+                is_fraction=is_fraction,
             )
-            for title, key, share in LEVEL_PLOTS
+            for title, key, is_fraction in LEVEL_PLOTS
         ]
         shown.append(f'<h3>{escape(label.capitalize())}</h3><div class="plots">{"".join(figures)}</div>')
     return shown
 
 
-def _series(name: str, look: Look, points: Sequence[Mapping[str, Any]], key: str) -> Series:
+def _series(name: str, style: LineStyle, points: Sequence[Mapping[str, Any]], key: str) -> Series:
     ends = [(point.get("intervals") or {}).get(key) or (None, None) for point in points]
     return Series(
         name=name,
-        look=look,
+        style=style,
         x=_numbers([point["level"] for point in points]),
         y=_numbers([point[key] for point in points]),
         low=_numbers([low for low, _ in ends]),

@@ -1,4 +1,4 @@
-"""Why estimates fail: every failed pose has one cause."""
+"""Causes of failures: one for every failed pose."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -8,8 +8,8 @@ from evalkit.report.svg_plots import Part
 from evalkit.tables.report_tables import cause_tables
 
 NOTE = (
-    "A pose has failed where it is missing or where its ADD(-S) is 0.1 diameter or more. The cause is the part of its "
-    "error without which it would pass, estimated from the poses."
+    "A pose has failed where it is missing or where its ADD(-S) is 0.1 diameter or more. The cause is the part of the "
+    "error without which the pose would pass, estimated from the poses."
 )
 PARTS = (
     Part(name="solved", colour="#dfe5ec", is_light=True),
@@ -29,7 +29,7 @@ def parts(summary: Mapping[str, Any]) -> list[str]:
     files = [file for file in summary["files"] if file["total"]["expected"]]
     if not files:
         return []
-    bars = [svg_plots.stacked_bar(file["name"], PARTS, _shares(file["causes"]["total"])) for file in files]
+    bars = [svg_plots.stacked_bar(file["name"], PARTS, _fractions(file["causes"]["total"])) for file in files]
     total, *by_object = map(html.table, cause_tables(summary))
     return [
         html.paragraph(NOTE, soft=True),
@@ -40,7 +40,7 @@ def parts(summary: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _shares(counts: Mapping[str, int]) -> list[float]:
+def _fractions(counts: Mapping[str, int]) -> list[float]:
     solved = counts["expected"] - counts["failed"]
     values = [solved, *(counts[part.name] for part in PARTS[1:])]
     return [value / counts["expected"] for value in values]

@@ -1,4 +1,4 @@
-"""What a reader should know first, in sentences."""
+"""The main results in sentences."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,11 +12,11 @@ FIRST = (
     ("re_sym_deg_median", "median rotation error", 1.0, "°", ".1f"),
     ("te_mm_median", "median distance of the origins", 1.0, " mm", ".1f"),
 )
-"""Scores that are said of every file: key, words, factor, unit, number format."""
+"""Scores in every file's sentence: key, words, factor, unit, number format."""
 
 
 def head(summary: Mapping[str, Any]) -> str:
-    """What stands below the page's title."""
+    """Text below the page's title."""
     dataset = summary["dataset"]
     files = summary["files"]
     count = f"{len(files)} result file{'s' * (len(files) != 1)}"
@@ -28,32 +28,32 @@ def head(summary: Mapping[str, Any]) -> str:
 
 
 def summary(summary: Mapping[str, Any]) -> list[str]:
-    """What changed against the start poses, and how good each file is."""
-    changes = "".join(_change(item) for item in (*summary["against_start"], *summary["against_first"]))
+    """Changes from the initial poses, and the scores of each file."""
+    changes = "".join(_change(item) for item in (*summary["against_initial"], *summary["against_first"]))
     files = html.heading("Result files") + html.items([file_words(file) for file in summary["files"]])
     return [f'<div class="words">{changes}{files}</div>']
 
 
 def _change(compared: Mapping[str, Any]) -> str:
-    said = [text[0].upper() + text[1:] + "." for text in compared["changes"]]
+    sentences = [text[0].upper() + text[1:] + "." for text in compared["changes"]]
     after = ""
-    if said:
+    if sentences:
         missing = compared["missing"]
         are = "pose is" if missing == 1 else "poses are"
         lost = f"{missing} {are} missing in {compared['name']}: failures in the tables. " if missing else ""
         after = f'<p class="note">{html.text(lost + interval_words(compared))}</p>'
     verdict = html.paragraph(compared["verdict"]) if compared["verdict"] else ""
-    return html.heading(compared["headline"]) + verdict + html.items(said) + after
+    return html.heading(compared["headline"]) + verdict + html.items(sentences) + after
 
 
 def file_words(file: Mapping[str, Any]) -> str:
-    """How good a file is, in one sentence."""
+    """The scores of a file in one sentence."""
     total, intervals = file["total"], file["intervals"]["total"]["intervals"]
-    said = [f"{total['found']} of {total['expected']} poses found"]
+    sentences = [f"{total['found']} of {total['expected']} poses found"]
     for key, label, factor, unit, style in FIRST:
         if total[key] is not None:
-            said.append(f"{label} {factor * total[key]:{style}}{unit}{_ends(intervals.get(key), factor, style)}")
-    return f"{file['name']}: {', '.join(said)}."
+            sentences.append(f"{label} {factor * total[key]:{style}}{unit}{_ends(intervals.get(key), factor, style)}")
+    return f"{file['name']}: {', '.join(sentences)}."
 
 
 def _ends(interval: Sequence[float] | None, factor: float, style: str) -> str:
