@@ -404,7 +404,7 @@ def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, ta
     trainer.close()
     with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
         assert refiner.scorer == ("learned" if output else "gradient")
-        assert refiner.tells_closeness == (output and target == "closeness")
+        assert refiner.predicts_pose_quality == (output and target == "closeness")
 
 
 class Unsure(torch.nn.Module):

@@ -33,10 +33,12 @@ from refinenet.config import load_config
 from refinenet.models import checkpoint
 from refinenet.models.networks import make_network
 from refinenet.refine.network_refiner import Refiner
-from refinenet.refiner import Refinement, Status, make_baseline
-from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile, VideoWriter
-from refinenet.tracking.state import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNJUDGED_TRACKING
-from refinenet.tracking.tracker import Tracker, usual_config
+from refinenet.refine.registry import MethodSettings, make_refiner
+from refinenet.refiner import Refinement, Status
+from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile
+from refinenet.tracking.state import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNSCORED_TRACKING
+from refinenet.tracking.tracker import Tracker, default_config
+from refinenet.tracking.video import VideoWriter
 
 from ..conftest import HEIGHT_PX, WIDTH_PX, K, background
 
@@ -112,7 +114,7 @@ def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
         "--patience", 3, "--quiet",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "14 frames, 9 tracking, 2 uncertain, 3 lost; 2 starts from a given pose" in result.stdout
+    assert "14 frames, 9 tracking, 2 uncertain, 3 lost; 2 starts from an initial pose" in result.stdout
     assert "frames/s tracking" in result.stdout
     found = {estimate.im_id: estimate for estimate in read_results(out, BopDataset(root))}
     assert sorted(found) == [i for i in range(FRAMES) if i not in GONE]
@@ -185,7 +187,9 @@ def test_search_is_believed_where_it_does_not_fail(cli, scene, tmp_path, monkeyp
     result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
-    result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--sure", 0.5)
+    result = cli(
+        "track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--tracking-threshold", 0.5
+    )
     assert read_sidecar(out)["states"]["lost"] == FRAMES
     assert "No pose, 3 times: the best pose has a confidence of 0.42" in result.stderr
 
@@ -252,11 +256,11 @@ def test_each_method_is_believed_by_its_own_rule(still, mesh, repository, tug_pl
     for made, usual in (
         (Refiner.load(still, {1: mesh}), GRADIENT_TRACKING),
         (Refiner.load(flow, {1: load_mesh(tug_ply)}), replace(LEARNED_TRACKING, depth_step=0.0)),
-        (make_baseline("search", {1: mesh}, 5), SEARCH_TRACKING),
-        (make_baseline("edge-icp", {1: mesh}, 5), UNJUDGED_TRACKING),
+        (make_refiner(MethodSettings(method="search", iterations=5), {1: mesh}, None), SEARCH_TRACKING),
+        (make_refiner(MethodSettings(method="edge-icp", iterations=5), {1: mesh}, None), UNSCORED_TRACKING),
     ):
         with closing(made):
-            assert usual_config(made) == usual
+            assert default_config(made) == usual
             assert Tracker(made, [1])._tracks[0].config == usual
 
 
@@ -264,7 +268,7 @@ def test_names_with_numbers_are_in_their_order(tmp_path):
     for number in (10, 2, 1):
         cv2.imwrite(str(tmp_path / f"f{number}.png"), np.full((HEIGHT_PX, WIDTH_PX, 3), number, np.uint8))
     folder = ImageFolder(folder=tmp_path, camera=FileCamera(file=tmp_path / "cam.json", K=K))
-    frames = list(folder.frames(make_baseline("edge-icp", {}, 1)))
+    frames = list(folder.frames(make_refiner(MethodSettings(method="edge-icp", iterations=1), {}, None)))
     assert [(number, frame.image[0, 0, 0]) for number, frame in frames] == [(0, 1), (1, 2), (2, 10)]
 
 
@@ -275,7 +279,10 @@ def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
             writer.write(rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8))
     content = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: len(content) // 2])
-    camera, method = FileCamera(file=tmp_path / "cam.json", K=K), make_baseline("edge-icp", {}, 1)
+    camera, method = (
+        FileCamera(file=tmp_path / "cam.json", K=K),
+        make_refiner(MethodSettings(method="edge-icp", iterations=1), {}, None),
+    )
     assert len(list(VideoFile(file=tmp_path / "whole.avi", camera=camera).frames(method))) == 20
     seen = []
     with pytest.raises(DatasetError, match=r"cut\.avi: ends after frame \d+ of 20, it is damaged or cut off"):
@@ -303,16 +310,20 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
         ([images, *pose], 2, "need --camera"),
         ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "found no numbers fx, fy, cx, cy"),
-        ([images, *pose, *camera], 2, "object 1 has a start pose and no mesh; give its file with --mesh"),
+        ([images, *pose, *camera], 2, "object 1 has an initial pose and no mesh; give its file with --mesh"),
         ([tmp_path / "empty", *pose, *camera], 1, "no images"),
         ([tmp_path / "no.mp4", *pose, *camera], 1, "cannot open it as a video"),
-        ([root, *init, "--sure", 0.2, "--found", 0.4], 2, "expected 0 <= found <= sure"),
+        (
+            [root, *init, "--tracking-threshold", 0.2, "--reacquire-threshold", 0.4],
+            2,
+            "expected 0 <= reacquire_threshold <= tr",
+        ),
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
         ([root, *init, *camera], 2, "--camera is for images and videos"),
         ([root, *init, "--fps", 10], 2, "--fps does nothing without --video: leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
-        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 looks like metres"),
+        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 is probably in metres"),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
         ([tmp_path / "twins", *pose, *camera], 1, "01.png and 1.png have one number"),
         ([root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),
@@ -329,10 +340,16 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     (tmp_path / "none.json").write_text("[]")
     shutil.copy(root / "pose.json", tmp_path / "x.json")
     for arguments, text in (
-        (["--method", "edge-icp", *init, "--sure", 0.9], "--sure does nothing for --method edge-icp, which tells no"),
+        (
+            ["--method", "edge-icp", *init, "--tracking-threshold", 0.9],
+            "--tracking-threshold does nothing for --method edge-icp, which has no",
+        ),
         (["--method", "edge-icp", *init, "--depth-step", 0.1], "--depth-step does nothing for --method edge-icp"),
         (["--method", "edge-icp", *init, "--object", 1, "--object", 9], "no pose of object 9 for scene 1"),
-        (["--method", "edge-icp", "--pose", tmp_path / "none.json"], "none.json: no pose; list where the objects are"),
+        (
+            ["--method", "edge-icp", "--pose", tmp_path / "none.json"],
+            "none.json: no pose; list the initial poses of the objects",
+        ),
         (["--method", "edge-icp", "--pose", tmp_path / "x.json"], "the sidecar of --out and --pose are both"),
     ):
         result = cli("track", root, *arguments, "--out", tmp_path / "x", "--quiet")
@@ -350,8 +367,8 @@ def test_search_is_asked_for_what_is_found(cli, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(GradientSearch, "_refine", refine)
     root, _ = scene
     out = tmp_path / "track.csv"
-    options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--sure", 0.2]
-    assert cli("track", root, *options, "--found", 0.1).exit_code == 0
+    options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--tracking-threshold", 0.2]
+    assert cli("track", root, *options, "--reacquire-threshold", 0.1).exit_code == 0
     assert set(asked) == {0.1}
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
 

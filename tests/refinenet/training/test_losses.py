@@ -153,7 +153,7 @@ def test_distance_is_bilinear_between_pixel_centres():
     torch.testing.assert_close(losses.sample_distance(distance, uv), expected)
 
 
-def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
+def test_the_confidence_is_drawn_to_the_visible_iou(mesh, shifted):
     """Added to any loss where there is a confidence; least where its sigmoid is the overlap."""
     b = len(shifted.K_crop)
     target = shifted._replace(overlap=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
