@@ -99,7 +99,10 @@ def test_a_pose_far_from_its_start_has_diverged(tug):
     turned = se3.make_T(se3.rotation_from_rotvec(np.array([0, np.deg2rad(70), 0])), start[:3, 3])
     moved_off = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.8 * tug.diameter_m]))
     near = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.7 * tug.diameter_m]))
-    for pose, words in ((turned, "turned by 70 deg and moved by 0.0 d"), (moved_off, "by 0 deg and moved by 0.8 d")):
+    for pose, words in (
+        (turned, "rotated by 70 deg and translated by 0.0 d"),
+        (moved_off, "by 0 deg and translated by 0.8 d"),
+    ):
         result = refined(start, pose, pose, 9, tug.diameter_m)
         assert result.status is Status.FAILED
         assert words in result.failure

@@ -5,7 +5,7 @@ import pytest
 from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
-from posecore.symmetry import ContinuousSymmetry
+from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
 from refinenet.refiner import Frame, Refinement, Status
 from refinenet.tracking.state import (
     Observation,
@@ -13,7 +13,6 @@ from refinenet.tracking.state import (
     TrackState,
     TrackStatus,
     at_depths,
-    nearest_copy,
     next_status,
     predicted,
 )
@@ -97,9 +96,9 @@ def test_an_object_of_revolution_does_not_spin(angle_rad):
     info = ModelInfo(diameter_m=0.1, symmetries_continuous=(AXIS,))
     before = pose(2)
     spun = before @ turned_about(*AXIS, angle_rad)
-    np.testing.assert_allclose(nearest_copy(spun, before, info), before, atol=1e-9)
+    np.testing.assert_allclose(nearest_symmetric(spun, before, info), before, atol=1e-9)
     moved = se3.apply_update(before, se3.rotation_from_rotvec(np.array([0.1, 0.05, 0.0])), np.array([0.01, 0, 0]))
-    chosen = nearest_copy(moved @ turned_about(*AXIS, angle_rad), before, info)
+    chosen = nearest_symmetric(moved @ turned_about(*AXIS, angle_rad), before, info)
     sampled = [
         se3.rotation_angle_rad((moved @ turned_about(*AXIS, a))[:3, :3] @ before[:3, :3].T)
         for a in np.linspace(0, 2 * np.pi, 2000)
@@ -110,13 +109,13 @@ def test_an_object_of_revolution_does_not_spin(angle_rad):
 def test_copies_of_discrete_symmetries_and_balls():
     before = pose(3)
     half = ModelInfo(diameter_m=0.1, symmetries_discrete=(HALF_TURN,))
-    np.testing.assert_allclose(nearest_copy(before @ se3.inverse(HALF_TURN), before, half), before, atol=1e-12)
+    np.testing.assert_allclose(nearest_symmetric(before @ se3.inverse(HALF_TURN), before, half), before, atol=1e-12)
     other = ContinuousSymmetry((1.0, 0.0, 0.0), AXIS.offset_m)
     ball = ModelInfo(diameter_m=0.1, symmetries_continuous=(AXIS, other))
     spun = before @ turned_about((0.3, -0.5, 0.7), AXIS.offset_m, 1.3)
-    np.testing.assert_allclose(nearest_copy(spun, before, ball), before, atol=1e-9)
+    np.testing.assert_allclose(nearest_symmetric(spun, before, ball), before, atol=1e-9)
     plain = ModelInfo(diameter_m=0.1)
-    np.testing.assert_array_equal(nearest_copy(spun, before, plain), spun)
+    np.testing.assert_array_equal(nearest_symmetric(spun, before, plain), spun)
 
 
 class Script:

@@ -9,7 +9,7 @@ from posecore.camera import back_project, crop_K
 from posecore.contour import trace
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.window import Window, cut, diameter_window
+from posecore.window import Window, cut_rgb, diameter_window, pixels_inside
 from scipy.special import ndtri
 
 from refinenet.refiner import render_obstacle
@@ -107,9 +107,7 @@ def render_and_crop(
     window = diameter_window(K, T_cam_obj, target.mesh.center_m, target.mesh.diameter_m, scale)
     K_patch = crop_K(K, window, patch_px)
     height_px, width_px = image.shape[:2]
-    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
-    u_px, v_px = window.x0_px + centre, window.y0_px + centre
-    in_image = ((v_px >= 0) & (v_px < height_px))[:, None] & ((u_px >= 0) & (u_px < width_px))[None]
+    in_image = pixels_inside(window, patch_px, width_px, height_px)
     if not in_image.any():
         return None
     layers = target.rasteriser.render(target.obj_id, K_patch, T_cam_obj[None], patch_px, patch_px)
@@ -118,7 +116,7 @@ def render_and_crop(
     if target.known_depth_m is not None:
         known_depth_m = nearest_pixels(target.known_depth_m, window, patch_px)
         occluder_depth_m = np.where(in_image & (known_depth_m > 0), known_depth_m, occluder_depth_m)
-    centre_z_m = T_cam_obj[2, :3] @ target.mesh.center_m + T_cam_obj[2, 3]
+    centre_z_m = target.mesh.center_cam_m(T_cam_obj)[2]
     visible = occluder_depth_m > np.where(mask, depth_m, centre_z_m)
     if not (mask & visible).any():
         return None
@@ -127,7 +125,7 @@ def render_and_crop(
         window=window,
         depth_m=depth_m,
         rgb=layers.rgb[0],
-        scene_rgb=_cut(image, window, patch_px),
+        scene_rgb=cut_rgb(image, window, patch_px, border="replicate"),
         occluder_depth_m=occluder_depth_m,
         visible=visible,
     )
@@ -139,19 +137,6 @@ def nearest_pixels(values: Shaped[Array, "h w"], window: Window, patch_px: int) 
     rows = np.floor(window.y0_px + centre).astype(int).clip(0, values.shape[0] - 1)
     columns = np.floor(window.x0_px + centre).astype(int).clip(0, values.shape[1] - 1)
     return np.asarray(values[rows[:, None], columns])
-
-
-def _cut(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
-    """The image patch of a window; replicated outside the image's border, so that no edge arises there."""
-    height_px, width_px = image.shape[:2]
-    margin = 8 + int(2 * window.side_px / patch_px)
-    x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
-    size = int(np.ceil(window.side_px)) + 2 * margin + 1
-    columns = np.arange(x0, x0 + size).clip(0, width_px - 1)
-    rows = np.arange(y0, y0 + size).clip(0, height_px - 1)
-    part = np.ascontiguousarray(image[rows[:, None], columns])
-    shifted = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
-    return np.asarray(cut(part, shifted, patch_px, interpolation="area"))
 
 
 def silhouette_edges(patch: Patch, n: int) -> Edges:

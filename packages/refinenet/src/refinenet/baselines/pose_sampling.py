@@ -86,7 +86,7 @@ def sample_offsets(config: SearchConfig, rng: np.random.Generator) -> Float[Arra
 
 def offset_poses(initial: Float[Array, "4 4"], offsets: Float[Array, "n 6"], mesh: Mesh) -> Float[Array, "n 4 4"]:
     """Poses at offsets: rotated about the mesh's centre, shifted across the image, scaled in depth along the ray."""
-    centre_m = initial[:3, :3] @ mesh.center_m + initial[:3, 3]
+    centre_m = mesh.center_cam_m(initial)
     across_m = np.pad(mesh.diameter_m * offsets[:, 3:5], ((0, 0), (0, 1)))
     R = se3.rotation_from_rotvec(offsets[:, :3]) @ initial[:3, :3]
     t = np.exp(offsets[:, 5:]) * (centre_m + across_m) - R @ mesh.center_m
@@ -110,7 +110,7 @@ def prior_distance(
     initial: Float[Array, "4 4"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh, config: SearchConfig
 ) -> float:
     """Squared distance of a pose from the initial pose, in standard deviations of the first draws."""
-    initial_m, centre_m = (T[:3, :3] @ mesh.center_m + T[:3, 3] for T in (initial, T_cam_obj))
+    initial_m, centre_m = mesh.center_cam_m(initial), mesh.center_cam_m(T_cam_obj)
     across_m = centre_m[:2] * initial_m[2] / centre_m[2] - initial_m[:2]
     angle_rad = float(se3.rotation_angle_rad(T_cam_obj[:3, :3] @ initial[:3, :3].T))
     tail_rad = max(0.0, angle_rad - config.max_angle_rad)

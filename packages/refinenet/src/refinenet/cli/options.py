@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 from click.core import ParameterSource
+from posecore import command_line
 
 from refinenet.refine.registry import METHODS, NETWORK, MethodSettings
 
@@ -40,7 +41,7 @@ other_mesh_option = click.option(
     "--allow-other-mesh", is_flag=True, help="Accept a mesh of the trained object's size that is not the trained one."
 )
 quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
-verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")
+verbose_option = command_line.verbose_option("refinenet")
 
 
 def require_distinct_files(inputs: Mapping[str, Path | None], outputs: Mapping[str, Path | None]) -> None:

@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
 import click
+from posecore.command_line import end_early, progress_bar
 
-from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -94,7 +94,6 @@ def refine(
     workers: int,
     allow_other_mesh: bool,
     quiet: bool,
-    verbose: bool,
 ) -> None:
     """Refine BOP estimates; method and settings go into the result file's sidecar.
 
@@ -109,7 +108,6 @@ def refine(
     refinenet refine --method search --dataset lmo --init start.csv --out searched.csv
     refinenet refine --method search --checkpoint flow.safetensors --dataset lmo --init start.csv --out both.csv
     """
-    start_logging(verbose)
     settings = MethodSettings(
         method=method, checkpoint=checkpoint, iterations=iterations, device=device, batch=batch, hypotheses=hypotheses,
         allow_other_mesh=allow_other_mesh, min_confidence=min_confidence, scorer=scorer, seed=seed,

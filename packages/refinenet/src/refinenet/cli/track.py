@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from posecore.command_line import end_early, progress_bar, renamed_options
 
-from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -78,6 +78,7 @@ SHOWN_REASONS = 3
 @other_mesh_option
 @quiet_option
 @verbose_option
+@renamed_options({"--sure": "--tracking-threshold", "--found": "--reacquire-threshold"})
 def track(
     source: Path,
     method: MethodName,
@@ -104,7 +105,6 @@ def track(
     threads: int,
     allow_other_mesh: bool,
     quiet: bool,
-    verbose: bool,
 ) -> None:
     """Track objects through SOURCE: a scene of a BOP dataset, a folder of images, or a video file.
 
@@ -117,7 +117,6 @@ def track(
     refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
         --out track.csv --video annotated.mp4
     """
-    start_logging(verbose)
     settings = MethodSettings(
         method=method, checkpoint=checkpoint, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh
     )

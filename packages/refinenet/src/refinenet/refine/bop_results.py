@@ -204,7 +204,7 @@ def refine_result_file(
 
 
 def _initial_poses(job: RefineJob, dataset: BopDataset) -> list[Estimate]:
-    estimates = read_results(job.init, dataset, of="camera")
+    estimates = read_results(job.init, dataset, images="camera")
     if not estimates:
         raise ConfigError(f"{job.init}: no poses in it, there is nothing to refine")
     chosen = [pose for pose in estimates if not job.objects or pose.obj_id in job.objects]

@@ -62,8 +62,8 @@ class MultiHypothesisRefiner:
     @property
     def settings(self) -> dict[str, Any]:
         """Settings for the sidecar."""
-        own = {"hypotheses": self._hypotheses, "scorer": self._scorer, "seed": self._seed}
-        return self._refiner.settings | own
+        hypothesis_set = {"hypotheses": self._hypotheses, "scorer": self._scorer, "seed": self._seed}
+        return self._refiner.settings | hypothesis_set
 
     def close(self) -> None:
         """Close the network."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from posecore.camera import crop_K, project
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
-from posecore.window import Window, cut_rgb, diameter_window, fixed_window
+from posecore.window import Window, cut_rgb, diameter_window, fixed_window, pixels_inside
 
 from refinenet.models.checkpoint import Provenance
 from refinenet.refiner import Frame, render_obstacle
@@ -91,8 +91,8 @@ class PatchRenderer:
             if not (depth_m[row] > 0).any():
                 failures[row] = f"its render at {T_cam_obj[row, 2, 3]:.3g} m covers no pixel"
             elif not ((depth_m[row] > 0) & inside[row]).any():
-                center = self._meshes[int(obj_id[row])].center_m
-                u, v = project(frame.K, (T_cam_obj[row, :3, :3] @ center + T_cam_obj[row, :3, 3])[None])[0]
+                centre_m = self._meshes[int(obj_id[row])].center_cam_m(T_cam_obj[row])
+                u, v = project(frame.K, centre_m[None])[0]
                 failures[row] = f"it lies at ({u:.0f}, {v:.0f}) px, outside the image of {width_px} x {height_px} px"
         visible = np.array([row for row in range(b) if failures[row] is None], np.int64)
         return Patches(
@@ -113,13 +113,6 @@ class PatchRenderer:
         # The training camera's fraction of the field of view, so that another camera shows the object at the same size.
         scale = float(K[0, 0]) / provenance.camera_fx_px if provenance.camera_fx_px > 0 else 1.0
         return fixed_window(mesh.vertices_m, K, T, side_px * scale)
-
-
-def pixels_inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[Array, "p p"]:
-    """Mask of the patch pixels that lie in the image."""
-    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
-    u, v = window.x0_px + centre, window.y0_px + centre
-    return ((v >= 0) & (v < height_px))[:, None] & ((u >= 0) & (u < width_px))[None]
 
 
 def _stacked(patches: Sequence[UInt8[Array, "p p 3"]], patch_px: int) -> UInt8[Array, "s p p 3"]:

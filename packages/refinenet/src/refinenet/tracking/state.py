@@ -1,4 +1,4 @@
-"""Track state machine: next status, predicted pose, nearest symmetric pose. No images."""
+"""Track state machine: next status, predicted pose, poses at other depths. No images."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 from posecore import se3
 from posecore.errors import ConfigError
-from posecore.symmetry import Symmetric, align_ball, is_ball, rotations_about_axis
 
 Array = np.ndarray
 
@@ -115,46 +114,3 @@ def at_depths(T_cam_obj: Float[Array, "4 4"], step: float) -> list[Float[Array, 
         T[:3, 3] *= factor
         poses.append(T)
     return poses
-
-
-def nearest_copy(
-    T_cam_obj: Float[Array, "4 4"], T_cam_obj_before: Float[Array, "4 4"], symmetries: Symmetric
-) -> Float[Array, "4 4"]:
-    """The pose that looks the same as `T_cam_obj` and is turned least against the one before.
-
-    Every listed discrete symmetry is tried. The angle about an axis of revolution is solved for, not sampled, so an
-    object that does not turn visibly does not turn at all.
-
-    Args:
-        T_cam_obj: New pose.
-        T_cam_obj_before: Pose to stay near to.
-        symmetries: Of the object.
-    """
-    copies = [T_cam_obj @ S for S in (np.eye(4), *symmetries.symmetries_discrete)]
-    continuous = symmetries.symmetries_continuous
-    if is_ball(continuous):
-        copies = [copy @ align_ball(continuous, copy, T_cam_obj_before) for copy in copies]
-    elif continuous:
-        copies = [
-            copy @ _untwist(copy, T_cam_obj_before, continuous[0].axis, continuous[0].offset_m) for copy in copies
-        ]
-    angles = [se3.rotation_angle_rad(copy[:3, :3] @ T_cam_obj_before[:3, :3].T) for copy in copies]
-    return np.asarray(copies[int(np.argmin(angles))])
-
-
-def _untwist(
-    T: Float[Array, "4 4"],
-    T_before: Float[Array, "4 4"],
-    axis: tuple[float, float, float],
-    offset_m: tuple[float, float, float],
-) -> Float[Array, "4 4"]:
-    """The turn S about an axis for which the rotation of T S is nearest to that of the pose before.
-
-    The trace of R_before^T R S(angle) is constant + B cos(angle) + C sin(angle); the angle that makes it largest makes
-    the rotation between them smallest.
-    """
-    unit = np.asarray(axis, np.float64) / np.linalg.norm(axis)
-    M = T_before[:3, :3].T @ T[:3, :3]
-    cross = np.array([[0.0, -unit[2], unit[1]], [unit[2], 0.0, -unit[0]], [-unit[1], unit[0], 0.0]])
-    angle_rad = np.arctan2(np.trace(M @ cross), np.trace(M) - unit @ M @ unit)
-    return np.asarray(rotations_about_axis(unit, np.array([angle_rad]), np.asarray(offset_m, np.float64))[0])

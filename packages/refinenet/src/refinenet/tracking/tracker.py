@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
-from posecore.symmetry import Symmetric
+from posecore.symmetry import Symmetric, nearest_symmetric
 
 from refinenet.refiner import Frame, PoseRefiner, Refinement, Request, ScoreKind
 from refinenet.tracking.state import (
@@ -18,7 +18,6 @@ from refinenet.tracking.state import (
     TrackState,
     TrackStatus,
     at_depths,
-    nearest_copy,
     next_status,
     predicted,
 )
@@ -110,7 +109,7 @@ class Track:
             )
         pose = result.T_cam_obj
         if self._observations and self.symmetries is not None:
-            pose = nearest_copy(pose, self._observations[-1].T_cam_obj, self.symmetries)
+            pose = nearest_symmetric(pose, self._observations[-1].T_cam_obj, self.symmetries)
         restarted = best >= self._continued
         # Across a gap there is no velocity: the motion in between is unknown.
         continues = bool(self._observations) and not restarted and not gap
