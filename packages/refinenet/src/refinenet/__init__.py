@@ -6,8 +6,6 @@ __version__ = "0.1.0"
 
 refuse_renamed_modules(
     {
-        "refinenet.inference": "refinenet.refine.Refiner",
-        "refinenet.loss": "refinenet.training.losses",
         "refinenet.methods": "refinenet.refiner and refinenet.refine.registry",
         "refinenet.tracker": "refinenet.tracking.tracker",
         "refinenet.views": "refinenet.refine.patches",
