@@ -67,7 +67,7 @@ def test_several_sensors_are_listed_until_one_is_named(root):
             shutil.copy(path, second / path.name.replace("cam1", "cam2"))
     change(second / "scene_camera_cam2.json", lambda c: c["4"]["cam_K"].__setitem__(0, 200.0))
     with pytest.raises(
-        DatasetError, match=r"several sensors \(cam1 in 2 scene\(s\), cam2 in 1 scene\(s\)\); say which"
+        DatasetError, match=r"several sensors \(cam1 in 2 scene\(s\), cam2 in 1 scene\(s\)\); choose one"
     ):
         BopDataset(root)
     with pytest.raises(DatasetError, match=r"no sensor 'cam3'; there are cam1 in 2"):
@@ -122,7 +122,7 @@ def test_the_split_is_found_by_its_name(root, made, chosen):
 def test_two_splits_of_one_kind_are_listed(root):
     shutil.copytree(root / "test", root / "test_kinect")
     (root / "test").rename(root / "test_primesense")
-    with pytest.raises(DatasetError, match=r"several splits \(test_kinect, test_primesense\); say which one"):
+    with pytest.raises(DatasetError, match=r"several splits \(test_kinect, test_primesense\); choose one"):
         BopDataset(root)
     assert BopDataset(root, "test_kinect").scene_ids == [3, 11]
 
@@ -227,7 +227,7 @@ def test_two_folders_of_one_scene_are_refused(root):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"4": [], "4": []}', "the key '4' stands twice"),
+        ('{"4": [], "4": []}', "the key '4' occurs twice"),
         ('{"4": [], "004": []}', "two keys mean 4, one of them '004'"),
         ('{"-4": []}', "a key is not an integer \\('-4'\\)"),
         ('{"4": ' + "[" * 100_000, "nested too deep"),

@@ -95,7 +95,7 @@ def test_broken_lines_are_named(tmp_path, line, message):
 def test_metres_are_suspected(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(f"{HEADER}\n1,2,3,0.5,1 0 0 0 1 0 0 0 1,0.01 0.02 0.9,-1\n")
-    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, which looks like metres"):
+    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, probably in metres"):
         read_results(path)
 
 

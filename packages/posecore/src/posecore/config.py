@@ -159,10 +159,10 @@ def assigned_keys(overrides: Sequence[str]) -> list[str]:
 
 
 def _leaves(mapping: Mapping[str, Any], prefix: str) -> list[str]:
-    found: list[str] = []
+    keys: list[str] = []
     for key, value in mapping.items():
-        found += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
-    return found
+        keys += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
+    return keys
 
 
 def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ _SQUARE = np.ones((3, 3), np.uint8)
 def contour_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Silhouette minus its 3 x 3 erosion.
 
-    Where the silhouette is cut by the patch's border there is no contour: what lies outside counts as silhouette.
+    Where the silhouette is cut by the patch's border there is no contour: the outside counts as silhouette.
     """
     inner = cv2.erode(mask.astype(np.uint8), _SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=[1])
     return np.asarray(mask & (inner == 0))
@@ -57,8 +57,8 @@ def sample_contour(
         mask: Silhouette.
         depth_m: Camera z of the same render.
         K: Camera matrix of the same image.
-        n: How many; without replacement where that many contour pixels exist.
-        rng: Decides where along the contour the first one lies.
+        n: Number of points; without replacement where that many contour pixels exist.
+        rng: Draws the position of the first point along the contour.
 
     Returns:
         (n, 3) camera-frame points, metres, at pixel centres.

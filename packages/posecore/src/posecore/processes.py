@@ -1,4 +1,4 @@
-"""Child processes: they exit with their parent and leave Ctrl-C to it; pools for tasks."""
+"""Child processes: they exit with their parent and ignore Ctrl-C; pools for tasks."""
 
 import ctypes
 import multiprocessing
@@ -22,7 +22,7 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
+    """Start processes that ignore Ctrl-C: a terminal sends it to all, and only the parent may stop the run.
 
     A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
     """
@@ -37,20 +37,20 @@ def interrupts_ignored() -> Iterator[None]:
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when its parent is gone, also by `kill -9` and while this one hangs.
+    """Have the kernel kill this process when its parent exits, also by `kill -9` and while this process hangs.
 
-    Only Linux can do that; elsewhere nothing happens, and multiprocessing's own watch has to do.
+    Only Linux can do that; elsewhere nothing happens, and only multiprocessing's own watch remains.
     """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
-    if parent is not None and os.getppid() != parent.pid:  # it went before the kernel was told
+    if parent is not None and os.getppid() != parent.pid:  # the parent exited before prctl took effect
         os._exit(1)
 
 
 def behave_as_worker() -> None:
-    """What a worker process does first: it ends with its parent, and leaves ctrl-C to it."""
+    """Prepare a worker process: it exits with its parent and ignores Ctrl-C."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -59,16 +59,16 @@ def behave_as_worker() -> None:
 def spawned(
     workers: int, start: Callable[..., None], arguments: tuple[Any, ...], died: str
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes, spawned because a forked GL context is undefined. At an error they end at once.
+    """A pool of spawned processes (a forked GL context is undefined); at an error they end at once.
 
     Args:
-        workers: How many.
+        workers: Number of processes.
         start: Called first in each; it begins with `behave_as_worker`.
         arguments: Its arguments.
-        died: What to say when one dies.
+        died: Message when a process dies.
 
     Raises:
-        RenderError: One died.
+        RenderError: A process died.
     """
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
@@ -91,7 +91,7 @@ def spawned(
 
 
 def in_order(pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Iterable[T], ahead: int) -> Iterator[R]:
-    """Results in the order of the tasks; at most `ahead` are made before they are asked for, as they take memory."""
+    """Results in the order of the tasks; at most `ahead` are computed in advance, as they take memory."""
     waiting: deque[Future[R]] = deque()
     for task in tasks:
         waiting.append(pool.submit(function, task))

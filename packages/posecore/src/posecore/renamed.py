@@ -91,7 +91,7 @@ def _get(mapping: Any, key: Sequence[str]) -> Any:
 
 
 def _moved(mapping: Mapping[str, Any], old: Sequence[str], new: Sequence[str], value: Any) -> dict[str, Any]:
-    """A copy with a value under another key, at its position where both keys are of one group."""
+    """A copy with a value under another key, at its position where both keys are in the same group."""
     if len(old) > 1 and len(new) > 1 and old[0] == new[0]:
         return {k: _moved(v, old[1:], new[1:], value) if k == old[0] else v for k, v in mapping.items()}
     if len(old) == len(new) == 1 and (old == new or new[0] not in mapping):

@@ -128,7 +128,7 @@ def even_directions(count: int) -> Float[np.ndarray, "n 3"]:
 
 
 def rotations_along(z: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
-    """`R_cam_obj` of cameras that look along unit vectors of the object frame, turned about them somehow."""
+    """`R_cam_obj` of cameras with optical axes along unit vectors of the object frame and any roll."""
     helper = np.where(np.abs(z[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
     x = np.cross(helper, z)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Object symmetries: the transforms that map an object onto itself, sampled finely enough to take a minimum over."""
+"""Object symmetries: transforms that map an object onto itself, sampled or solved for."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
@@ -32,7 +32,7 @@ class ContinuousSymmetry(NamedTuple):
 
 @runtime_checkable
 class Symmetric(Protocol):
-    """What has symmetries: `posecore.bop.ModelInfo`."""
+    """An object with symmetries: `posecore.bop.ModelInfo`."""
 
     @property
     def symmetries_discrete(self) -> tuple[Float[np.ndarray, "4 4"], ...]:
@@ -59,13 +59,13 @@ def rotations_about_axis(
     return transforms
 
 
-def _turns(step_rad: float) -> Float[np.ndarray, " n"]:
+def _angles_rad(step_rad: float) -> Float[np.ndarray, " n"]:
     count = max(1, int(np.ceil(2.0 * np.pi / step_rad - 1e-9)))
     return np.arange(count) * (2.0 * np.pi / count)
 
 
 def is_ball(continuous: Sequence[ContinuousSymmetry]) -> bool:
-    """Whether the axes generate every rotation: two of them are not parallel."""
+    """Whether the axes generate every rotation: any two are not parallel."""
     first = np.array(continuous[0].axis) if continuous else np.zeros(3)
     return any(np.linalg.norm(np.cross(first, other.axis)) > 1e-3 for other in continuous[1:])
 
@@ -85,13 +85,13 @@ def _continuous_transforms(continuous: Sequence[ContinuousSymmetry], step_rad: f
         return np.eye(4)[None]
     first = np.array(continuous[0].axis)
     if not is_ball(continuous):
-        return rotations_about_axis(first, _turns(step_rad), np.array(continuous[0].offset_m))
-    # Two axes composed once reach a surface in the rotation group, not all of it: Euler angles z-y-z reach all.
+        return rotations_about_axis(first, _angles_rad(step_rad), np.array(continuous[0].offset_m))
+    # Two axes composed once reach a surface in the rotation group; Euler angles z-y-z reach the whole group.
     center = ball_center_m(continuous)
     helper = np.eye(3)[int(np.argmin(np.abs(first)))]
     second = np.cross(first, helper)
     step = max(step_rad, BALL_STEP_RAD)
-    spins = rotations_about_axis(first, _turns(step), center)
+    spins = rotations_about_axis(first, _angles_rad(step), center)
     tilts = rotations_about_axis(second, np.linspace(0.0, np.pi, int(np.ceil(np.pi / step)) + 1), center)
     inner = np.einsum("aij,bjk->abik", tilts[1:-1], spins).reshape(-1, 4, 4)
     body = np.einsum("aij,bjk->abik", spins, inner).reshape(-1, 4, 4)
@@ -107,14 +107,14 @@ def symmetry_transforms(info: Symmetric, max_step_rad: float = BOP_STEP_RAD) -> 
 
     Args:
         info: discrete and continuous symmetries of the object.
-        max_step_rad: largest angle between neighbouring samples of one axis.
+        max_step_rad: largest angle between neighbouring samples about an axis.
 
     Returns:
-        Transforms S with `T_cam_obj @ S` looking the same as `T_cam_obj`.
+        Transforms S with which `T_cam_obj @ S` has the same appearance as `T_cam_obj`.
     """
     fixed = np.stack([np.eye(4), *info.symmetries_discrete])
-    turning = _continuous_transforms(info.symmetries_continuous, max_step_rad)
-    return np.asarray(np.einsum("cij,djk->cdik", turning, fixed).reshape(-1, 4, 4))
+    continuous = _continuous_transforms(info.symmetries_continuous, max_step_rad)
+    return np.asarray(np.einsum("cij,djk->cdik", continuous, fixed).reshape(-1, 4, 4))
 
 
 def align_ball(

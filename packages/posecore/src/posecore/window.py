@@ -1,4 +1,4 @@
-"""The square window that scene and hypothesis patches are cut with."""
+"""The square crop window of scene and hypothesis patches."""
 
 from dataclasses import dataclass
 from typing import Literal

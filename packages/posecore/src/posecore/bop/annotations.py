@@ -1,4 +1,4 @@
-"""What a BOP dataset says of an image: cameras, true poses and targets, in metres, checked as they are read."""
+"""Annotations of a BOP image: camera, ground truth and targets, in metres, checked while reading."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -18,13 +18,13 @@ LARGEST_DEPTH_SCALE = 1e6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundTruth:
-    """One annotated object of one image.
+    """An annotated object in an image.
 
     Attributes:
         obj_id: object.
         T_cam_obj: (4, 4) pose, metres, as in the file (real annotations are orthonormal to about 0.01 only); all NaN
-            where BOP says there is no pose.
-        visib_fract: visible share of the silhouette in [0, 1], or None where `scene_gt_info.json` is missing.
+            where BOP marks the pose as unknown.
+        visib_fract: visible fraction of the silhouette in [0, 1], or None where `scene_gt_info.json` is missing.
         gt_index: position in the image's list, the number in mask file names.
         has_pose: False where BOP marks the pose as unknown (t = -1, -1, -1).
     """
@@ -38,7 +38,7 @@ class GroundTruth:
 
 @dataclass(frozen=True, kw_only=True, order=True)
 class BopTarget:
-    """An object to be found in an image, `inst_count` times."""
+    """An object of which `inst_count` instances are expected in an image (BOP's targets)."""
 
     scene_id: int
     im_id: int
@@ -86,13 +86,13 @@ def ground_truth(entry: Any, index: int, visib_fract: float | None, where: str) 
 
 
 def visib_fract(entry: Any, where: str) -> float | None:
-    """Visible share of an object from its entry in `scene_gt_info.json`; None where it is not given.
+    """Visible fraction of an object from its entry in `scene_gt_info.json`; None where it is not given.
 
     Raises:
-        DatasetError: the entry is not one, or the share is not from 0 to 1; the message starts with `where`.
+        DatasetError: the entry is not one, or the fraction is not from 0 to 1; the message starts with `where`.
     """
     if not isinstance(entry, dict):
-        raise DatasetError(f"{where}: found a {type(entry).__name__}, expected the numbers of one object")
+        raise DatasetError(f"{where}: found a {type(entry).__name__}, expected an object with numbers")
     return fraction(entry, "visib_fract", where) if "visib_fract" in entry else None
 
 

@@ -24,7 +24,7 @@ __all__ = ["BopDataset", "BopTarget", "GroundTruth"]
 
 
 class BopDataset:
-    """One split of a BOP dataset. Files are read when asked for; annotations of the scenes used last are kept."""
+    """One split of a BOP dataset. Files are read on demand; annotations of the last scenes are cached."""
 
     def __init__(self, root: str | Path, split: str | None = None, sensor: str | None = None) -> None:
         """Open a dataset folder.
@@ -64,7 +64,7 @@ class BopDataset:
         return isinstance(self._source, ShardSource)
 
     def scene_path(self, scene_id: int) -> Path:
-        """Folder of a scene; where scenes lie in tar files, the one it would be.
+        """Folder of a scene; it does not exist where scenes lie in tar files.
 
         Raises:
             DatasetError: there is no such scene.
@@ -82,7 +82,7 @@ class BopDataset:
         return self._source.files(scene_id)
 
     def forget(self, scene_id: int) -> None:
-        """Free what is kept in memory of a scene; it is read again when it is asked for."""
+        """Free a scene's annotations in memory; they are read again when they are needed."""
         self._source.forget(scene_id)
 
     def im_ids(self, scene_id: int) -> list[int]:
@@ -90,12 +90,12 @@ class BopDataset:
         return self._source.im_ids(scene_id, "gt" if self.has_gt(scene_id) else "camera")
 
     def annotation(self, scene_id: int, kind: Kind) -> str:
-        """Where a scene's entries of a kind are or would be, for errors."""
+        """Location of a scene's entries of a kind, for errors; it need not exist."""
         self._require(scene_id)
         return self._source.annotation(scene_id, kind)
 
     def annotated_by(self, scene_id: int, kind: Kind = "gt") -> str:
-        """What decides which images a scene has, in words for an error."""
+        """Annotation that lists the images of a scene, for errors."""
         if kind == "gt" and self.has_gt(scene_id):
             return f"ground truth in {self._source.annotation(scene_id, 'gt')}"
         return f"camera in {self._source.annotation(scene_id, 'camera')}"
@@ -106,7 +106,7 @@ class BopDataset:
         return self._source.has(scene_id, "gt")
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str] | None:
-        """What the files say of an image as it stands there, and where; None where the scene has none of this kind.
+        """Unparsed annotation of an image and its location for errors; None where the scene has none of this kind.
 
         Args:
             scene_id: scene.
@@ -126,7 +126,7 @@ class BopDataset:
 
     @cached_property
     def targets(self) -> list[BopTarget]:
-        """What is to be found: the split's targets file (BOP19, else BOP24), else all ground truth with a pose.
+        """Objects to be estimated: the split's targets file (BOP19, else BOP24), else all ground truth with a pose.
 
         Targets without an object (BOP24 detection) are filled in from ground truth.
 
@@ -178,22 +178,22 @@ class BopDataset:
             target = BopTarget(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
             key = (scene_id, im_id, target.obj_id)
             if key in seen:  # its poses would be expected twice
-                raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one of them")
+                raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one")
             seen[key] = f"entry {where.rsplit(' ', 1)[-1]}"
             yield target
 
     def _annotated_targets(self, scene_id: int, im_id: int) -> list[BopTarget]:
-        found = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
+        annotated = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
         return [
-            BopTarget(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=found.count(obj_id))
-            for obj_id in sorted(set(found))
+            BopTarget(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=annotated.count(obj_id))
+            for obj_id in sorted(set(annotated))
         ]
 
     def camera(self, scene_id: int, im_id: int) -> Camera:
-        """Intrinsics of one image; its size is that of the image file, else the one in `camera.json`.
+        """Intrinsics of an image; the size is that of the image file, else that in `camera.json`.
 
         Raises:
-            DatasetError: the image has no camera, it is no pinhole, or its size is nowhere to be found.
+            DatasetError: the image has no camera, it is no pinhole, or its size is given nowhere.
         """
         self._require(scene_id)
         entry, where = self._source.entry(scene_id, im_id, "camera")
@@ -269,7 +269,7 @@ class BopDataset:
         return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
 
     def depth_scale(self, scene_id: int, im_id: int) -> float:
-        """Millimetres for one step of the image's depth; 1 where the files do not say.
+        """Millimetres for one step of the image's depth; 1 where the files give none.
 
         Raises:
             DatasetError: it is not above 0.
@@ -285,13 +285,13 @@ class BopDataset:
         Raises:
             DatasetError: the mask is damaged.
         """
-        found = self.mask_and_place(scene_id, im_id, gt_index, "mask_visib" if visible else "mask")
-        return None if found is None else found[0]
+        located = self.mask_and_location(scene_id, im_id, gt_index, "mask_visib" if visible else "mask")
+        return None if located is None else located[0]
 
-    def mask_and_place(
+    def mask_and_location(
         self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
     ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
-        """As `mask`, with where it lies."""
+        """As `mask`, with the file that holds it, for errors."""
         self._require(scene_id)
         return self._source.mask(scene_id, im_id, gt_index, kind)
 
@@ -340,9 +340,9 @@ class BopDataset:
         They are `models`, then those of a type (`models_cad`) by name, then those for evaluation (`models_eval`);
         with `eval` these come first.
         """
-        found = sorted(path for path in self.root.glob("models*") if path.is_dir() and _is_models(path.name))
-        plain = [path for path in found if not path.name.endswith("_eval")]
-        simplified = [path for path in found if path.name.endswith("_eval")]
+        folders = sorted(path for path in self.root.glob("models*") if path.is_dir() and _is_models(path.name))
+        plain = [path for path in folders if not path.name.endswith("_eval")]
+        simplified = [path for path in folders if path.name.endswith("_eval")]
         return simplified + plain if eval else plain + simplified
 
     @property

@@ -1,4 +1,4 @@
-"""Image files of a BOP dataset: which one there is, its size, its pixels."""
+"""Image files of a BOP dataset: lookup, size, pixels."""
 
 import struct
 import zlib
@@ -42,7 +42,9 @@ def read_image(file: Path | StoredFile, flags: int) -> Shaped[np.ndarray, "h w *
         data = b""
     size = _stated_size(data)
     if size is not None and not 0 < size[0] * size[1] <= LARGEST_IMAGE_PX:
-        raise DatasetError(f"{source}: says it is {size[0]} x {size[1]} pixels; the file is damaged, copy it again")
+        raise DatasetError(
+            f"{source}: its header gives {size[0]} x {size[1]} pixels; the file is damaged, copy it again"
+        )
     image = None
     if data and _is_whole(data):
         try:
@@ -57,8 +59,8 @@ def read_image(file: Path | StoredFile, flags: int) -> Shaped[np.ndarray, "h w *
 def _is_whole(data: bytes) -> bool:
     """Whether a PNG or JPEG ends as it should.
 
-    OpenCV fills the rest of a JPEG that is cut off with grey, and lets libpng complain on stderr about a PNG. A PNG
-    carries checksums, which some of its readers do not look at.
+    OpenCV fills the rest of a truncated JPEG with grey and prints libpng's warnings about a PNG. Pillow's `verify`
+    accepts truncated JPEGs and takes 80 to 150 us more for each file.
     """
     if data.startswith(_PNG):
         return _whole_png(data)

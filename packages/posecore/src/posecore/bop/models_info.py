@@ -31,7 +31,7 @@ ROTATION_TOLERANCE = 2e-2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ModelInfo:
-    """What `models_info.json` says of one object.
+    """An object's entry in `models_info.json`.
 
     Attributes:
         diameter_m: largest distance between two vertices, metres.

@@ -1,4 +1,4 @@
-"""Result files as columns: a million lines in seconds, and the exact line and field of everything that is wrong."""
+"""Result files as columns: a million lines in seconds; each fault with its line and field."""
 
 import math
 import warnings
@@ -15,24 +15,24 @@ from posecore.errors import ResultFileError
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 HEADER = ",".join(COLUMNS)
 COUNTS = {"R": 9, "t": 3}
-"""Numbers in a column's field, where it is not one."""
+"""Numbers in a field of these columns; 1 in the others."""
 LARGEST_T_MM = 1e9
 CHUNK_BYTES = 1 << 23
 _IDS = COLUMNS[:3]
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _PLAIN = b"0123456789+-.eE, \n"
-"""What a line of plain decimal numbers is made of. Lines with anything else are read one by one."""
+"""Characters of plain decimal numbers. Lines with any other are parsed one by one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineFault:
-    """What is wrong in one line of a result file.
+    """A fault in a line of a result file.
 
     Attributes:
         line: from 1; 0 where it is the file as a whole.
         field: column, or "line".
         kind: short name of the rule that is broken.
-        message: what was found and what is expected, without the place.
+        message: found and expected value, without the location.
     """
 
     line: int
@@ -86,8 +86,8 @@ def parse_results(data: bytes, name: str, on_fault: Callable[[LineFault], None] 
 
     Args:
         data: the file; translations in millimetres.
-        name: what errors call it.
-        on_fault: is told every fault, in the file's order; faulty lines are left out. Without it the first one raises.
+        name: of the file, for errors.
+        on_fault: called with every fault, in the file's order; faulty lines are left out. By default the first raises.
 
     Raises:
         ResultFileError: the file is empty or not UTF-8, its header is unknown; or, without `on_fault`, a line breaks
@@ -236,19 +236,19 @@ def _line_by_line(
             faults.append(LineFault(line=number, field="line", kind="fields", message=message))
             continue
         by_name = dict(zip(order, parts, strict=True))
-        found: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = {}
         id_values: list[int] = []
         for column in COLUMNS:
             try:
                 if column in _IDS:
                     id_values.append(_id(by_name[column], column))
                 else:
-                    found[column] = _floats(by_name[column], COUNTS.get(column, 1), column)
+                    values[column] = _floats(by_name[column], COUNTS.get(column, 1), column)
             except ResultFileError as error:
                 faults.append(LineFault(line=number, field=column, kind="format", message=str(error)))
         if len(faults) == wrong:
             ids.append(id_values)
-            numbers.append([value for column in COLUMNS[3:] for value in found[column]])
+            numbers.append([value for column in COLUMNS[3:] for value in values[column]])
             lines.append(number)
     n = len(lines)
     return (
@@ -284,7 +284,7 @@ def _floats(text: str, count: int, column: str) -> list[float]:
 def _valid(
     numbers: Float[np.ndarray, "n 14"], lines: Int[np.ndarray, " n"]
 ) -> tuple[Bool[np.ndarray, " n"], list[LineFault]]:
-    """Which lines hold finite numbers, a rotation and a possible translation, and what is wrong in the others."""
+    """Mask of the lines with finite numbers, a rotation and a plausible translation, and the others' faults."""
     finite = np.isfinite(numbers)
     good = finite.all(axis=1)
     faults = []

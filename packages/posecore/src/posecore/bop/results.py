@@ -73,8 +73,8 @@ def read_results(
 
     Args:
         path: CSV file; translations in millimetres.
-        dataset: where given, scenes, images and objects that it does not have are errors.
-        images: which images it has, see `unknown_ids`.
+        dataset: if given, unknown scenes, images and objects are errors.
+        images: images that are known, see `unknown_ids`.
 
     Raises:
         ResultFileError: as `read_result_table`.
@@ -92,8 +92,8 @@ def read_result_table(
 
     Args:
         path: CSV file; translations in millimetres.
-        dataset: where given, scenes, images and objects that it does not have are errors.
-        images: which images it has, see `unknown_ids`.
+        dataset: if given, unknown scenes, images and objects are errors.
+        images: images that are known, see `unknown_ids`.
 
     Raises:
         ResultFileError: missing or empty file, a line that breaks the format, NaN, a scaled or mirrored rotation, an
@@ -149,26 +149,26 @@ def estimate_table(estimates: Sequence[Estimate]) -> ResultTable:
 
 
 def metres_fault(table: ResultTable) -> LineFault | None:
-    """What says that a file's translations are in metres, or None."""
+    """Fault if a file's translations are probably in metres, else None."""
     if not len(table):
         return None
     median_mm = float(np.median(np.abs(table.T_cam_obj[:, 2, 3]))) / MM
     if median_mm >= SUSPICIOUS_DISTANCE_MM:
         return None
     message = (
-        f"the median t_z of the file is {median_mm:.4g}, which looks like metres; "
+        f"the median t_z of the file is {median_mm:.4g}, probably in metres; "
         "BOP result files hold millimetres, multiply t by 1000"
     )
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
 
 
 def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "camera"] = "gt") -> list[LineFault]:
-    """Lines whose scene, image or object the dataset does not have; the first of the three is named.
+    """Lines with a scene, image or object that the dataset does not have; the first of the three is reported.
 
     Args:
-        table: Lines.
-        dataset: What they are of.
-        images: Which images count: the annotated ones where a scene has ground truth, or all that have a camera.
+        table: Result file.
+        dataset: Its dataset.
+        images: `gt`: only annotated images where a scene has ground truth; `camera`: all images with a camera.
     """
     faults: dict[int, LineFault] = {}
 
@@ -193,11 +193,11 @@ def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "
         "im_id",
         lambda i: f"image {table.im_id[i]} has no {dataset.annotated_by(int(table.scene_id[i]), images)}",
     )
-    known = ", ".join(map(str, dataset.obj_ids))
+    listed = ", ".join(map(str, dataset.obj_ids))
     note(
         ~np.isin(table.obj_id, dataset.obj_ids),
         "obj_id",
-        lambda i: f"object {table.obj_id[i]} is unknown, {dataset.name} has {known}",
+        lambda i: f"object {table.obj_id[i]} is unknown, {dataset.name} has {listed}",
     )
     return [faults[index] for index in sorted(faults)]
 

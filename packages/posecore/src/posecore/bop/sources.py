@@ -1,4 +1,4 @@
-"""Where the annotations and images of a BOP split lie: scene folders, of one sensor or several."""
+"""Files of a BOP split's annotations and images: scene folders, for a single sensor or several."""
 
 import os
 import re
@@ -25,7 +25,7 @@ _CAMERA_FILE = re.compile(r"scene_camera(?:_(.+))?\.json")
 
 @runtime_checkable
 class Source(Protocol):
-    """Annotations and images of one split. Errors are DatasetErrors that name file and image."""
+    """Annotations and images of a split. Errors are DatasetErrors that name file and image."""
 
     scene_ids: list[int]
 
@@ -38,11 +38,11 @@ class Source(Protocol):
         ...
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str]:
-        """What is annotated of an image, and where that stands."""
+        """Annotation of an image, and its location for errors."""
         ...
 
     def annotation(self, scene_id: int, kind: Kind) -> str:
-        """Where a scene's entries of this kind are or would be, for errors."""
+        """Location of a scene's entries of this kind, for errors; it need not exist."""
         ...
 
     def image(self, scene_id: int, im_id: int, layer: Layer) -> StoredFile | None:
@@ -52,7 +52,7 @@ class Source(Protocol):
     def mask(
         self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
     ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
-        """An annotated silhouette and where it lies, or None where there is none."""
+        """An annotated silhouette and its file, or None where there is none."""
         ...
 
     def scene_path(self, scene_id: int) -> Path:
@@ -64,12 +64,12 @@ class Source(Protocol):
         ...
 
     def forget(self, scene_id: int) -> None:
-        """Free what is kept in memory of a scene."""
+        """Free a scene's annotations in memory."""
         ...
 
 
 class FolderSource:
-    """Scene folders (`000001/scene_camera.json`, `rgb/`, `depth/`), or one sensor's part of them.
+    """Scene folders (`000001/scene_camera.json`, `rgb/`, `depth/`), or the files of a single sensor in these.
 
     With several sensors, annotations and image folders carry the sensor's name: `scene_camera_cam1.json`,
     `rgb_cam1/`, `mask_visib_cam1/`; in HOT3D the image folder is the name itself (`scene_gt_gray1.json`, `gray1/`).
@@ -81,8 +81,8 @@ class FolderSource:
         Args:
             split_path: folder of the split.
             scenes: scene folders, and the sensors that each has, as `scenes_of` gives them.
-            sensors: wanted, the preferred one first; a scene with none of them is left out. The empty name stands for
-                files without a sensor's name.
+            sensors: sensors by preference; a scene without any is left out. The empty name stands for files without
+                a sensor's name.
 
         Raises:
             DatasetError: two folders are the same scene.
@@ -90,13 +90,13 @@ class FolderSource:
         self.split_path = split_path
         self._paths: dict[int, Path] = {}
         self._sensors: dict[int, str] = {}
-        for scene, there in scenes.items():
-            chosen = [sensor for sensor in sensors if sensor in there]
+        for scene, available in scenes.items():
+            chosen = [sensor for sensor in sensors if sensor in available]
             if not chosen:
                 continue
             number = int(scene.name)
             if number in self._paths:
-                raise DatasetError(f"{scene}: is scene {number} as {self._paths[number].name} is; remove one of them")
+                raise DatasetError(f"{scene}: is scene {number} as {self._paths[number].name} is; remove one")
             self._paths[number], self._sensors[number] = scene, chosen[0]
         self.scene_ids = sorted(self._paths)
         self._kept: OrderedDict[tuple[int, Kind], tuple[dict[int, Any], int]] = OrderedDict()
@@ -131,7 +131,7 @@ class FolderSource:
         return sorted(self._content(scene_id, kind))
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str]:
-        """Value of one key."""
+        """Value of the image's key."""
         content, file = self._content(scene_id, kind), self._file(scene_id, kind)
         if im_id not in content:
             raise DatasetError(f"{file}: no entry for image {im_id}; there are {some(sorted(content))}")
@@ -210,8 +210,8 @@ def _sensors_of(scene: Path) -> frozenset[str]:
         names = os.listdir(scene)
     except OSError as error:
         raise DatasetError(f"{scene}: cannot be listed ({error.strerror}); change its rights") from error
-    found = (_CAMERA_FILE.fullmatch(name) for name in names)
-    return frozenset(match[1] or "" for match in found if match)
+    matches = (_CAMERA_FILE.fullmatch(name) for name in names)
+    return frozenset(match[1] or "" for match in matches if match)
 
 
 def some(ids: list[int], limit: int = 8) -> str:

@@ -1,4 +1,4 @@
-"""Writing BOP datasets: a frame at a time, images first, the JSON that makes it count last."""
+"""Writer of BOP datasets: frame by frame, images first, the JSON that lists them last."""
 
 import json
 import os
@@ -22,13 +22,13 @@ from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh, save_ply
 
 SCENE_FILES = ("scene_gt_info.json", "scene_camera.json", "scene_gt.json")
-"""In writing order: scene_gt.json, which decides what frames there are, is the last."""
+"""In writing order: scene_gt.json, which lists the frames, is the last."""
 JOURNAL = ".frames.jsonl"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameEntry:
-    """What the three JSON files of a scene say about one frame. Plain data: it may come from another process."""
+    """Entries of a frame in the three JSON files of its scene. Plain data, so that another process can make it."""
 
     info: list[dict[str, Any]]
     camera: dict[str, Any]
@@ -86,7 +86,7 @@ class FrameFiles:
             raise DatasetError(f"image format: found '{self.image_format}', expected png or jpg")
 
     def write(self, im_id: int, frame: FrameRecord) -> FrameEntry:
-        """Write colour, depth and masks of one frame; the frame counts once its entry is committed.
+        """Write colour, depth and masks of a frame, which counts once its entry is committed.
 
         Raises:
             DatasetError: counts or sizes disagree, or a depth does not fit into 16 bits.
@@ -276,7 +276,7 @@ def gt_info(
     """The entry of `scene_gt_info.json` for one object.
 
     Definitions are those of bop_toolkit's calc_gt_info: `px_count_all` counts the whole silhouette, also outside the
-    image; `px_count_valid` its pixels in the image whose depth is known (all of them without depth);
+    image; `px_count_valid` its pixels in the image whose depth is known (all pixels without depth);
     `visib_fract` = visible / all; a box is x, y of its first pixel and last minus first pixel as width and height, and
     all -1 where nothing is visible.
     """
@@ -338,21 +338,21 @@ def write_targets(root: str | Path, split: str, targets: Iterable[BopTarget]) ->
 
 
 def visible_targets(root: str | Path, split: str, scene_id: int, min_visible: float = 0.1) -> list[BopTarget]:
-    """What is to be found in a scene: each object of an image with how many instances are visible enough.
+    """Targets of a scene: each object of an image with the number of instances that are visible enough.
 
-    The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible share of 0.1, and an
+    The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible fraction of 0.1, and an
     object without one is no target.
 
     Args:
         root: dataset folder.
         split: split folder's name.
         scene_id: a finished scene.
-        min_visible: smallest visible share.
+        min_visible: smallest visible fraction.
     """
     folder = scene_folder(root, split, scene_id)
-    truth, info = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
+    annotated, info = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
     targets = []
-    for im_id, gts in truth.items():
+    for im_id, gts in annotated.items():
         seen = Counter(
             gt["obj_id"] for gt, about in zip(gts, info[im_id], strict=True) if about["visib_fract"] >= min_visible
         )

@@ -1,4 +1,4 @@
-"""The field table: what a sample holds, and how its values become stored numbers."""
+"""The field table: fields of a sample and the quantisation of their values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ class Field:
     """One row of the field table.
 
     Attributes:
-        name: np.ndarray name in the group; ends in its unit where it has one.
+        name: Array name in the group; ends in its unit where it has one.
         dtype: On disk.
         shape: Without the sample axis; "P" patch_px, "C" contour_points.
         unit: Of the decoded value.
@@ -42,12 +42,12 @@ class Field:
     squared: bool = False
 
     def size(self, patch_px: int, contour_points: int) -> tuple[int, ...]:
-        """Shape of one sample's value."""
+        """Shape of a sample's value."""
         symbols = {"P": patch_px, "C": contour_points}
         return tuple(symbols[s] if isinstance(s, str) else s for s in self.shape)
 
     def step(self, card: Mapping[str, Any]) -> float | None:
-        """What one step of the stored integer is worth in `unit`; None when values are stored exactly.
+        """Value of a step of the stored integer, in `unit`; None when values are stored exactly.
 
         Raises:
             ShardError: The card lacks the entry that `scale` names.

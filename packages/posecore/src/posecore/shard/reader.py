@@ -122,9 +122,9 @@ class ShardReader:
         key = shard_key(field, shard_id)
         data, expected = self._store.get(key), line["bytes"].get(field.name)
         if data is None or len(data) != expected:
-            found = "no file" if data is None else f"{len(data)} bytes"
+            actual = "no file" if data is None else f"{len(data)} bytes"
             raise ShardError(
-                f"{self.url}/{key}: found {found}, expected {expected} bytes; the shard is damaged: run the same "
+                f"{self.url}/{key}: found {actual}, expected {expected} bytes; the shard is damaged: run the same "
                 "`synthgen render` again, which renders damaged shards anew"
             )
         return data

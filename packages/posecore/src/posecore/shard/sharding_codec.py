@@ -148,7 +148,7 @@ def _with_crc(data: bytes) -> bytes:
 
 def _checked(data: memoryview) -> memoryview:
     """Bytes without the checksum behind them."""
-    body, found = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
-    if google_crc32c.value(bytes(body)) != int.from_bytes(found, "little"):
+    body, checksum = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
+    if google_crc32c.value(bytes(body)) != int.from_bytes(checksum, "little"):
         raise ValueError("checksum differs")
     return body
