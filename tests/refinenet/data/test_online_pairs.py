@@ -9,7 +9,7 @@ from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig, load
 from refinenet.data.online_pairs import PairMaker, draw_hypothesis
 from refinenet.image import augmentation
 from refinenet.image.crops import optical_axis_turn, recut_affine, warp
-from refinenet.image.masks import visible_fraction, visible_iou
+from refinenet.image.masks import visible_fraction, visible_mask_iou
 
 
 @pytest.fixture(scope="module")
@@ -208,15 +208,15 @@ def test_overlap_is_one_at_the_truth_whatever_covers_it_and_zero_apart():
     bits[2:6, 2:6] = 1 | 2 | 4
     truth = bits > 0
     apart = np.roll(truth, 4, axis=1) & ~truth
-    assert visible_iou(truth, bits) == 1
+    assert visible_mask_iou(truth, bits) == 1
     for background in (np.uint8(0), np.uint8(4)):  # a wall is foreground too, and hides nothing
-        assert visible_iou(np.roll(truth, 2, axis=0), bits | background) == pytest.approx(8 / 24)
+        assert visible_mask_iou(np.roll(truth, 2, axis=0), bits | background) == pytest.approx(8 / 24)
     bits[2:6, 2:4] = 1 | 4
     assert visible_fraction(bits) == 0.5
-    assert visible_iou(truth, bits) == 1
-    assert visible_iou(apart, bits) == 0
+    assert visible_mask_iou(truth, bits) == 1
+    assert visible_mask_iou(apart, bits) == 0
     bits[2:6, 2:6] = 1 | 4
-    assert visible_iou(truth, bits) == 0
+    assert visible_mask_iou(truth, bits) == 0
     assert visible_fraction(np.zeros((3, 8, 8), np.uint8)).tolist() == [0, 0, 0]
 
 

@@ -8,7 +8,7 @@ from posecore import contour
 from refinenet.data.pair_stream import PairSource
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
-from refinenet.image.masks import visible_iou
+from refinenet.image.masks import visible_mask_iou
 from refinenet.models import checkpoint
 from refinenet.training import losses
 from refinenet.training.loop import train
@@ -83,7 +83,7 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     home = losses.contour_loss_px(true, after.target)
     assert home.mean() < 0.5 * losses.contour_loss_px(stay, after.target).mean()
     assert home.mean() < 2.5
-    overlap = visible_iou((after.pair.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
+    overlap = visible_mask_iou((after.pair.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
     np.testing.assert_allclose(after.target.overlap.numpy(), overlap, atol=0.03)
 
 

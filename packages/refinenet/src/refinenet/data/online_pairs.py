@@ -21,7 +21,7 @@ from posecore.window import Window
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig
 from refinenet.image import augmentation
 from refinenet.image.crops import hypothesis_window, optical_axis_turn, recut_affine, warp
-from refinenet.image.masks import visible_fraction, visible_iou
+from refinenet.image.masks import visible_fraction, visible_mask_iou
 
 Array = np.ndarray
 MIN_CONTOUR_PX = 12
@@ -186,7 +186,7 @@ class PairMaker:
             hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
             hypothesis_depth_m=depth[seen],
             scene_bits=scene_bits,
-            overlap=visible_iou(depth[seen] > 0, scene_bits),
+            overlap=visible_mask_iou(depth[seen] > 0, scene_bits),
             render_colours=render_colours,
             obj_id=obj_ids[seen],
             kept=np.array([d.index for d in drafts]),

@@ -10,7 +10,7 @@ from posecore.shard import BIT_FOREGROUND
 from refinenet.config import AugmentConfig, TrainConfig
 from refinenet.data.online_pairs import PairArrays
 from refinenet.image import augmentation
-from refinenet.image.masks import visible_iou
+from refinenet.image.masks import visible_mask_iou
 
 STORED_FIELDS = (
     "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
@@ -53,7 +53,7 @@ def stored_pairs(
             )
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
     depth_m = stack("hypothesis_depth_m") if "hypothesis_depth_m" in samples[0] else None
-    overlap = None if depth_m is None else visible_iou(depth_m > 0, stack("scene_mask"))
+    overlap = None if depth_m is None else visible_mask_iou(depth_m > 0, stack("scene_mask"))
     scene_rgb, hypothesis_rgb, render_colours = augmentation.colour(
         scenes, stack("hypothesis_rgb"), augment_config, rngs[0]
     )

@@ -18,7 +18,7 @@ def visible_fraction(bits: UInt8[Array, "*b p p"]) -> Float[Array, "*b"]:
     return np.asarray(visible / np.maximum(whole, 1), np.float64)
 
 
-def visible_iou(hypothesis: Bool[Array, "*b p p"], bits: UInt8[Array, "*b p p"]) -> Float[Array, "*b"]:
+def visible_mask_iou(hypothesis: Bool[Array, "*b p p"], bits: UInt8[Array, "*b p p"]) -> Float[Array, "*b"]:
     """Intersection over union of a hypothesis' silhouette and the object's visible mask, without occluded pixels.
 
     1 for the ground-truth pose at any occlusion, 0 where the object is not visible or the masks do not meet. Beside the

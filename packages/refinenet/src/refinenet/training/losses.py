@@ -26,7 +26,7 @@ class Target(NamedTuple):
         hypothesis_distance_px: (b, p, p) distance transform of the hypothesis' contour.
         object_index: (b,) row of each sample's object in `ObjectPoints`.
         scene_bits: (b, p, p) the scene's masks in the patch, bits as in shards' `scene_mask`; None where not known.
-        overlap: (b,) how well the hypothesis' silhouette fits what is visible, see `masks.visible_iou`.
+        overlap: (b,) how well the hypothesis' silhouette fits what is visible, see `masks.visible_mask_iou`.
     """
 
     T_cam_obj: Float[Tensor, "b 4 4"]

@@ -28,7 +28,7 @@ from refinenet.data.pair_stream import Batch
 from refinenet.data.split import OWN
 from refinenet.geometry import poses
 from refinenet.image.crops import hypothesis_window
-from refinenet.image.masks import visible_iou
+from refinenet.image.masks import visible_mask_iou
 from refinenet.models.networks import Pair
 from refinenet.training.losses import Target, sample_distance
 
@@ -205,7 +205,7 @@ class OwnPredictions:
             scene_distance_px=distance.unflatten(1, (patch_px, patch_px)) * real(looks.scale)[:, None, None],
             hypothesis_distance_px=real([contour.distance_transform_px(outline) for outline in looks.outline]),
             scene_bits=torch.from_numpy(looks.bits).to(pair.K_crop.device),
-            overlap=None if target.overlap is None else real(visible_iou(masks, looks.bits)),
+            overlap=None if target.overlap is None else real(visible_mask_iou(masks, looks.bits)),
         )
         return Batch(new_pair, new_target, torch.from_numpy(looks.kept))
 
