@@ -19,8 +19,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import torch
+from refinenet.batch import Batch
 from refinenet.config import PRESETS, load_config
-from refinenet.data.pair_stream import Batch
 from refinenet.training.run import Trainer
 from torch.utils.flop_counter import FlopCounterMode
 

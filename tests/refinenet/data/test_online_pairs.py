@@ -183,9 +183,9 @@ def test_occluders_hide_part_of_the_object_and_nothing_else(mesh, rasteriser, sa
     plain = make_pairs(mesh, rasteriser, samples, fresh=True)
     config = AugmentConfig(occlusion=1.0, occlusion_leaves=0.4)
     covered = make_pairs(mesh, rasteriser, samples, fresh=True, augment_config=config)
-    assert (plain.visible_share == 1).all()
-    assert (covered.visible_share >= 0.4).all()
-    assert (covered.visible_share < 0.98).sum() >= 4
+    assert (plain.visible_fraction == 1).all()
+    assert (covered.visible_fraction >= 0.4).all()
+    assert (covered.visible_fraction < 0.98).sum() >= 4
     changed = (plain.scene_rgb != covered.scene_rgb).any(axis=-1)
     over = (covered.scene_bits & 4 > 0) & (covered.scene_bits & 2 == 0)
     assert not (changed & ~over).any()

@@ -45,7 +45,7 @@ def take(stream, n):
 
 def assert_equal(first, second):
     for a, b in zip(first, second, strict=True):
-        for x, y in zip((*a.pair, *a.target, a.sample_ids), (*b.pair, *b.target, b.sample_ids), strict=True):
+        for x, y in zip((*a.inputs, *a.target, a.sample_ids), (*b.inputs, *b.target, b.sample_ids), strict=True):
             torch.testing.assert_close(x, y, rtol=0, atol=0)
 
 

@@ -6,6 +6,7 @@ import torch
 from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.symmetry import ContinuousSymmetry
+from refinenet.batch import LossTarget
 from refinenet.data.objects import object_points
 from refinenet.geometry import poses, symmetry
 from refinenet.training import losses, validation
@@ -95,7 +96,7 @@ def target_of(T_true, T_hypothesis):
     flat = torch.zeros(N, 64, 64, dtype=torch.float64)
     K = torch.tensor([[300.0, 0, 32], [0, 300, 32], [0, 0, 1]], dtype=torch.float64).expand(N, 3, 3)
     rows = torch.zeros(N, dtype=torch.int64)
-    return losses.Target(torch.from_numpy(T_true), torch.from_numpy(T_hypothesis), K, none, none, flat, flat, rows)
+    return LossTarget(torch.from_numpy(T_true), torch.from_numpy(T_hypothesis), K, none, none, flat, flat, rows)
 
 
 def test_closeness_of_an_exact_pose_is_one(mesh):

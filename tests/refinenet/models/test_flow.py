@@ -9,6 +9,7 @@ from posecore.camera import back_project, crop_K
 from posecore.errors import ConfigError
 from posecore.raster import Rasteriser
 from posecore.window import diameter_window
+from refinenet.batch import LossTarget
 from refinenet.config import load_config
 from refinenet.data.pair_stream import PairSource
 from refinenet.geometry import poses
@@ -20,7 +21,6 @@ from refinenet.models.networks import FlowNet, make_network
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Status
 from refinenet.training import losses, validation
-from refinenet.training.losses import Target
 from refinenet.training.on_policy import OwnPredictions
 from refinenet.training.run import Trainer
 from scipy.spatial.transform import Rotation
@@ -160,7 +160,7 @@ def test_rotations_by_a_vector_are_posecores():
 def targets(scenes):
     truth, guess, K_crop, _ = scenes
     none = torch.zeros(len(truth), 1, 3)
-    return Target(truth, guess, K_crop, none, none, none, none, torch.zeros(len(truth), dtype=torch.int64))
+    return LossTarget(truth, guess, K_crop, none, none, none, none, torch.zeros(len(truth), dtype=torch.int64))
 
 
 def points_of(mesh, *symmetries):
@@ -266,10 +266,10 @@ def test_the_nearest_twin_is_as_close(scenes, mesh):
 
 def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
     """Cross-entropy is least for the confidence that says just that."""
-    target = targets(scenes)._replace(overlap=torch.full((4,), 0.25, dtype=torch.float64))
+    target = targets(scenes)._replace(visible_iou=torch.full((4,), 0.25, dtype=torch.float64))
     close = losses.closeness(target, points_of(mesh))
     update = solved(true_flow(*scenes), scenes[1], scenes[2], mesh)
-    for name, wanted in (("overlap", target.overlap), ("closeness", close)):
+    for name, wanted in (("overlap", target.visible_iou), ("closeness", close)):
         cost = losses.make_loss(
             "flow+point", gamma=1.0, point_weight=0.0, confidence_target=name, objects=points_of(mesh)
         )
@@ -299,15 +299,15 @@ def batch_of(dataset, config, training=True, n=8):
 
 def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh):
     fresh = batch_of(dataset, flow_config())
-    assert batch_of(dataset, small()).pair.hypothesis_depth_m is None
+    assert batch_of(dataset, small()).inputs.hypothesis_depth_m is None
     config = flow_config("own_predictions.share=1", "own_predictions.begin=0", "own_predictions.full=0")
     with OwnPredictions(config, {1: mesh}) as own:
         moved = own(Moves(), fresh, step=3)
-    shape = [batch.pair.hypothesis_depth_m > 0 for batch in (fresh, moved)]
+    shape = [batch.inputs.hypothesis_depth_m > 0 for batch in (fresh, moved)]
     assert (shape[0] != shape[1]).float().mean() > 0.01
     with Rasteriser({1: mesh}) as rasteriser:
         for batch in (fresh, moved):
-            pair = batch.pair
+            pair = batch.inputs
             layers = rasteriser.render(1, pair.K_crop.double().numpy(), pair.T_cam_obj.double().numpy(), 64, 64)
             there = pair.hypothesis_depth_m.numpy()
             assert ((there > 0) == layers.mask).mean() > 0.999
@@ -316,7 +316,7 @@ def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh
 
 
 def test_stored_pairs_have_their_depth_too(dataset):
-    pairs = batch_of(dataset, flow_config("hypothesis.fresh=false", "window.kind=fixed")).pair
+    pairs = batch_of(dataset, flow_config("hypothesis.fresh=false", "window.kind=fixed")).inputs
     mask = (pairs.hypothesis_rgb > 0).any(1)
     assert ((pairs.hypothesis_depth_m > 0) == mask).float().mean() > 0.99
 
@@ -331,10 +331,10 @@ def test_it_learns_where_points_went(dataset, tmp_path):
     def error_px():
         network.eval()
         with torch.no_grad():
-            update = network(batch.pair)
-        true_px = offsets_to_px(update.flow, batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.pair.K_crop)
+            update = network(batch.inputs)
+        true_px = offsets_to_px(update.flow, batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.inputs.K_crop)
         off = (update.flow.offset_px - true_px).norm(dim=-1)
-        left = poses.update_between(poses.apply_update(batch.pair.T_cam_obj, update), batch.target.T_cam_obj)
+        left = poses.update_between(poses.apply_update(batch.inputs.T_cam_obj, update), batch.target.T_cam_obj)
         return float(off[update.flow.on_object].mean()), float(poses.rotation_angle_deg(left.dR).mean())
 
     before = error_px()
@@ -351,9 +351,9 @@ def test_every_weight_gets_a_gradient(dataset):
     config = flow_config("network.confidence=true")
     batch = batch_of(dataset, config)
     network = make_network(config.network)
-    update = network(batch.pair)
+    update = network(batch.inputs)
     value = losses.flow_loss(update, batch.target, points_of_dataset(dataset))
-    (value + losses.confidence_loss(update, batch.target.overlap)).mean().backward()
+    (value + losses.confidence_loss(update, batch.target.visible_iou)).mean().backward()
     for name, weight in network.named_parameters():
         assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
         assert weight.grad.abs().sum() > 0, name
@@ -432,7 +432,7 @@ def test_what_the_loss_leaves_out_is_not_measured(dataset):
     close = losses.closeness(batch.target, points)
     counted = close >= 0.2
     assert 0 < counted.sum() < len(counted)
-    before = validation.pose_errors(batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
+    before = validation.pose_errors(batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
 
     def measured(least):
         return validation.measure(Unsure(), [batch], points, torch.device("cpu"), "closeness", least)

@@ -3,12 +3,12 @@ import pytest
 import torch
 from posecore import contour, se3
 from posecore.raster import Rasteriser
+from refinenet.batch import LossTarget
 from refinenet.data.objects import farthest_points
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.geometry.symmetry import ObjectPoints
 from refinenet.training import losses
-from refinenet.training.losses import Target
 from torch.autograd import gradcheck
 
 PATCH_PX = 128
@@ -28,7 +28,7 @@ def make_target(mesh, rasteriser, pairs, seed=0):
         transforms = [contour.distance_transform_px(contour.contour_mask(layers.mask[i])) for i in range(2)]
         rows.append((truth, guess, K, *points, *transforms))
     columns = [torch.from_numpy(np.stack(column).astype(np.float64)) for column in zip(*rows, strict=True)]
-    return Target(*columns, torch.zeros(len(rows), dtype=torch.int64))
+    return LossTarget(*columns, torch.zeros(len(rows), dtype=torch.int64))
 
 
 def object_points(mesh, symmetries=None):
@@ -156,7 +156,7 @@ def test_distance_is_bilinear_between_pixel_centres():
 def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
     """Added to any loss where there is a confidence; least where its sigmoid is the overlap."""
     b = len(shifted.K_crop)
-    target = shifted._replace(overlap=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
+    target = shifted._replace(visible_iou=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
     logits = torch.zeros(b, requires_grad=True)
     chosen = losses.make_loss("contour", gamma=1, point_weight=1, confidence_weight=2, objects=object_points(mesh))
     plain, still = losses.contour_loss_px(identity(target), target), identity(target)
@@ -164,7 +164,7 @@ def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
     torch.testing.assert_close(chosen(still, target), plain)
     torch.testing.assert_close((with_logits - plain).float(), torch.full((b,), 2 * float(np.log(2))))
     (gradient,) = torch.autograd.grad(with_logits.sum(), logits)
-    torch.testing.assert_close(gradient, 2 * (0.5 - target.overlap))
+    torch.testing.assert_close(gradient, 2 * (0.5 - target.visible_iou))
 
 
 def test_what_is_far_off_teaches_the_confidence_alone(mesh, turned):

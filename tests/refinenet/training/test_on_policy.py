@@ -58,13 +58,13 @@ def test_the_share_grows_and_then_stays():
 
 def test_hypotheses_go_where_the_network_moved_them(mesh, batch):
     after = moved(mesh, batch)
-    wanted = poses.apply_update(batch.pair.T_cam_obj, Moves()(batch.pair))
-    torch.testing.assert_close(after.pair.T_cam_obj, wanted, atol=1e-5, rtol=0)
+    wanted = poses.apply_update(batch.inputs.T_cam_obj, Moves()(batch.inputs))
+    torch.testing.assert_close(after.inputs.T_cam_obj, wanted, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.target.T_cam_obj, batch.target.T_cam_obj)
     torch.testing.assert_close(after.target.T_cam_obj_hypothesis, wanted, atol=1e-5, rtol=0)
     centre = torch.from_numpy(mesh.center_m.astype(np.float32)).repeat(8, 1, 1)
     at = centre @ wanted[:, :3, :3].transpose(1, 2) + wanted[:, None, :3, 3]
-    assert (poses.project(after.pair.K_crop, at) - 32).abs().max() < 1e-2  # the window inference would cut
+    assert (poses.project(after.inputs.K_crop, at) - 32).abs().max() < 1e-2  # the window inference would cut
 
 
 def test_scene_and_labels_follow_the_new_window(mesh, batch):
@@ -72,7 +72,7 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     from posecore.raster import Rasteriser
 
     after = moved(mesh, batch)
-    K, T = after.pair.K_crop.double().numpy(), after.target.T_cam_obj.double().numpy()
+    K, T = after.inputs.K_crop.double().numpy(), after.target.T_cam_obj.double().numpy()
     with Rasteriser({1: mesh}) as rasteriser:
         truth = rasteriser.render(1, K, T, 64, 64)
     for mask, distance, bits in zip(truth.mask, after.target.scene_distance_px, after.target.scene_bits, strict=True):
@@ -83,8 +83,8 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     home = losses.contour_loss_px(true, after.target)
     assert home.mean() < 0.5 * losses.contour_loss_px(stay, after.target).mean()
     assert home.mean() < 2.5
-    overlap = visible_overlap((after.pair.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
-    np.testing.assert_allclose(after.target.overlap.numpy(), overlap, atol=0.03)
+    overlap = visible_overlap((after.inputs.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
+    np.testing.assert_allclose(after.target.visible_iou.numpy(), overlap, atol=0.03)
 
 
 def test_renders_keep_the_batchs_colours(mesh, batch):
@@ -97,9 +97,9 @@ def test_renders_keep_the_batchs_colours(mesh, batch):
 
     with OwnPredictions(small(*OWN), {1: mesh}) as own:
         after = own(Stays(), batch, step=0)
-    difference = (after.pair.hypothesis_rgb.int() - batch.pair.hypothesis_rgb.int()).abs()
+    difference = (after.inputs.hypothesis_rgb.int() - batch.inputs.hypothesis_rgb.int()).abs()
     assert (difference <= 1).float().mean() > 0.99
-    assert (after.pair.scene_rgb.int() - batch.pair.scene_rgb.int()).abs().float().mean() < 1
+    assert (after.inputs.scene_rgb.int() - batch.inputs.scene_rgb.int()).abs().float().mean() < 1
 
 
 def test_a_network_gone_astray_leaves_pairs_as_they_were(mesh, batch):
@@ -111,17 +111,17 @@ def test_a_network_gone_astray_leaves_pairs_as_they_were(mesh, batch):
 
     with OwnPredictions(small(*OWN), {1: mesh}) as own:
         after = own(Astray(), batch, step=0)
-    assert torch.equal(after.pair.hypothesis_rgb, batch.pair.hypothesis_rgb)
-    assert torch.equal(after.pair.T_cam_obj, batch.pair.T_cam_obj)
+    assert torch.equal(after.inputs.hypothesis_rgb, batch.inputs.hypothesis_rgb)
+    assert torch.equal(after.inputs.T_cam_obj, batch.inputs.T_cam_obj)
 
 
 def test_part_of_a_batch_is_replaced_and_the_same_part_again(mesh, batch):
     half = "own_predictions.share=0.5"
     first, again = moved(mesh, batch, half), moved(mesh, batch, half)
-    changed = (first.pair.T_cam_obj != batch.pair.T_cam_obj).flatten(1).any(1)
+    changed = (first.inputs.T_cam_obj != batch.inputs.T_cam_obj).flatten(1).any(1)
     assert changed.sum() == 4
-    assert torch.equal(first.pair.hypothesis_rgb, again.pair.hypothesis_rgb)
-    assert torch.equal(first.pair.hypothesis_rgb[~changed], batch.pair.hypothesis_rgb[~changed])
+    assert torch.equal(first.inputs.hypothesis_rgb, again.inputs.hypothesis_rgb)
+    assert torch.equal(first.inputs.hypothesis_rgb[~changed], batch.inputs.hypothesis_rgb[~changed])
 
 
 def test_each_object_is_seen_through_its_own_window(mesh, batch):
@@ -131,7 +131,7 @@ def test_each_object_is_seen_through_its_own_window(mesh, batch):
     mixed = batch._replace(target=batch.target._replace(object_index=index))
     with OwnPredictions(small(*OWN), {7: twice, 3: mesh}) as own:
         after = own(Moves(), mixed, step=0)
-    T, K = after.pair.T_cam_obj, after.pair.K_crop
+    T, K = after.inputs.T_cam_obj, after.inputs.K_crop
     across = K[:, 0, 0] * mesh.diameter_m / (T[:, :3, :3] @ torch.from_numpy(mesh.center_m).float() + T[:, :3, 3])[:, 2]
     assert across[index == 0].numpy() == pytest.approx(64 / 1.5, rel=0.02)
     assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 import torch
+from refinenet.batch import Batch
 from refinenet.config import OptimiserConfig, load_config
-from refinenet.data.pair_stream import Batch
 from refinenet.errors import TrainingError
 from refinenet.training.optimiser import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 from refinenet.training.run import Trainer

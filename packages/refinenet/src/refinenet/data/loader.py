@@ -16,7 +16,8 @@ from posecore.errors import PoseError
 from posecore.processes import interrupts_ignored
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from refinenet.data.pair_stream import Batch, PairStream
+from refinenet.batch import Batch
+from refinenet.data.pair_stream import PairStream
 from refinenet.errors import LoaderError
 
 SHARED_MEMORY = Path("/dev/shm")
@@ -44,7 +45,7 @@ def require_shared_memory(batch: Batch, in_flight: int) -> None:
     """
     if not SHARED_MEMORY.is_dir():
         return
-    tensors = (*batch.pair, *batch.target, batch.sample_ids, batch.visible_share, batch.render_colours)
+    tensors = (*batch.inputs, *batch.target, batch.sample_ids, batch.visible_fraction, batch.render_colours)
     needed = in_flight * sum(x.nbytes for x in tensors if x is not None)
     size = shutil.disk_usage(SHARED_MEMORY).total  # what is free already lacks the batches of faster processes
     if size < needed:
@@ -145,7 +146,7 @@ def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]
             there = batch.to(device)
         main = torch.cuda.current_stream(device)
         main.wait_stream(side)
-        for tensor in (*there.pair, *there.target):
+        for tensor in (*there.inputs, *there.target):
             if tensor is not None:
                 tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
         yield there

@@ -32,7 +32,7 @@ ATTEMPTS = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairArrays:
-    """One batch of pairs, every label in its patch's pixels; see `loss.Target` for the fields' meaning.
+    """One batch of pairs, every label in its patch's pixels; see `LossTarget` for the fields' meaning.
 
     `kept` names the input samples the rows came from: one whose object cannot be seen in any window is left out and
     another stands in its place.
@@ -49,13 +49,13 @@ class PairArrays:
     hypothesis_distance_px: Float[Array, "b p p"]
     hypothesis_depth_m: Float[Array, "b p p"] | None
     scene_bits: UInt8[Array, "b p p"]
-    overlap: Float[Array, " b"] | None
+    visible_iou: Float[Array, " b"] | None
     render_colours: Float[Array, "b 3 3"]
     obj_id: Array
     kept: Array
 
     @property
-    def visible_share(self) -> Float[Array, " b"]:
+    def visible_fraction(self) -> Float[Array, " b"]:
         """How much of each object is visible in its patch, after augmentation."""
         return visible_share(self.scene_bits)
 
@@ -186,7 +186,7 @@ class PairMaker:
             hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
             hypothesis_depth_m=depth[seen],
             scene_bits=scene_bits,
-            overlap=visible_overlap(depth[seen] > 0, scene_bits),
+            visible_iou=visible_overlap(depth[seen] > 0, scene_bits),
             render_colours=render_colours,
             obj_id=obj_ids[seen],
             kept=np.array([d.index for d in drafts]),

@@ -7,17 +7,17 @@ run resumes in the middle of an epoch by arithmetic, and a pair's pose does not 
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
 from posecore.errors import ConfigError, ShardError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, load_meshes
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from refinenet.batch import Batch, LossTarget, NetworkInput
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.data.growing_split import Growth
 from refinenet.data.objects import for_patches, load_models, symmetries_of
@@ -25,39 +25,11 @@ from refinenet.data.online_pairs import PairArrays, PairMaker
 from refinenet.data.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
 from refinenet.data.stored_pairs import STORED_FIELDS, stored_pairs
 from refinenet.image.crops import fixed_sides_px
-from refinenet.models.networks import Pair
-from refinenet.training.losses import Target
 
 Array = np.ndarray
 RECUT_FIELDS = (
     "scene_rgb", "scene_mask", "scene_contour_cam_m", "T_cam_obj", "T_cam_obj_hypothesis", "K", "window_px", "obj_id",
 )  # fmt: skip
-
-
-class Batch(NamedTuple):
-    """What a step consumes.
-
-    Attributes:
-        pair: What the network sees.
-        target: What the loss compares its update with.
-        sample_ids: (b, 2) shard and row of every pair.
-        skipped: What is wrong with shards that others stand in for, each told once by the process that met it.
-        visible_share: How much of each object is visible in its patch.
-        render_colours: What augmentation did to the colours of each render; stays on the processor.
-    """
-
-    pair: Pair
-    target: Target
-    sample_ids: Int[Tensor, "b 2"]
-    skipped: tuple[str, ...] = ()
-    visible_share: Float[Tensor, " b"] | None = None
-    render_colours: Float[Tensor, "b 3 3"] | None = None
-
-    def to(self, device: torch.device) -> "Batch":
-        """The same on another device; copies from pinned memory are only queued."""
-        pair = self.pair.mapped(lambda x: x.to(device, non_blocking=True))
-        target = self.target.mapped(lambda x: x.to(device, non_blocking=True))
-        return self._replace(pair=pair, target=target)
 
 
 class PairSource:
@@ -167,7 +139,7 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
     start, K_crop = real(arrays.T_cam_obj_hypothesis), real(arrays.K_crop)
-    target = Target(
+    target = LossTarget(
         T_cam_obj=real(arrays.T_cam_obj),
         T_cam_obj_hypothesis=start,
         K_crop=K_crop,
@@ -177,13 +149,13 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
         hypothesis_distance_px=real(arrays.hypothesis_distance_px),
         object_index=torch.tensor([object_index[int(i)] for i in arrays.obj_id]),
         scene_bits=torch.from_numpy(np.ascontiguousarray(arrays.scene_bits)),
-        overlap=None if arrays.overlap is None else real(arrays.overlap),
+        visible_iou=None if arrays.visible_iou is None else real(arrays.visible_iou),
     )
     depth_m = None if arrays.hypothesis_depth_m is None else real(arrays.hypothesis_depth_m)
-    pair = Pair(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop, depth_m)
+    inputs = NetworkInput(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop, depth_m)
     return Batch(
-        pair, target, torch.tensor(np.array(ids, np.int64)),
-        visible_share=real(arrays.visible_share), render_colours=real(arrays.render_colours),
+        inputs, target, torch.tensor(np.array(ids, np.int64)),
+        visible_fraction=real(arrays.visible_fraction), render_colours=real(arrays.render_colours),
     )  # fmt: skip
 
 

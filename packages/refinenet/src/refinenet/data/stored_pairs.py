@@ -53,7 +53,7 @@ def stored_pairs(
             )
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
     depth_m = stack("hypothesis_depth_m") if "hypothesis_depth_m" in samples[0] else None
-    overlap = None if depth_m is None else visible_overlap(depth_m > 0, stack("scene_mask"))
+    visible_iou = None if depth_m is None else visible_overlap(depth_m > 0, stack("scene_mask"))
     scene_rgb, hypothesis_rgb, render_colours = augmentation.colour(
         scenes, stack("hypothesis_rgb"), augment_config, rngs[0]
     )
@@ -69,7 +69,7 @@ def stored_pairs(
         hypothesis_distance_px=stack("hypothesis_distance_px"),
         hypothesis_depth_m=depth_m,
         scene_bits=stack("scene_mask"),
-        overlap=overlap,
+        visible_iou=visible_iou,
         render_colours=render_colours,
         obj_id=stack("obj_id"),
         kept=np.arange(len(samples)),

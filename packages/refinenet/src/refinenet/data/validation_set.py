@@ -5,9 +5,10 @@ from typing import Any
 
 from posecore.errors import ShardError
 
+from refinenet.batch import Batch
 from refinenet.config import TrainConfig
 from refinenet.data.growing_split import Growth
-from refinenet.data.pair_stream import Batch, PairSource
+from refinenet.data.pair_stream import PairSource
 from refinenet.data.split import Split, spread_rows
 
 

@@ -17,9 +17,9 @@ from posecore.errors import CheckpointError, ConfigError
 from posecore.files import write_atomic
 from torch import Tensor, nn
 
+from refinenet.batch import NetworkInput
 from refinenet.config import NetworkConfig
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.models.networks import Pair
 
 INPUTS = ("scene_rgb", "hypothesis_rgb", "T_cam_obj", "K_crop", "hypothesis_depth_m")
 """The last for networks that see depth only."""
@@ -44,7 +44,7 @@ class FlatNetwork(nn.Module):
         hypothesis_depth_m: Tensor | None = None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         """The update of each pair, in camera axes about the object's origin."""
-        update = self.network(Pair(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
+        update = self.network(NetworkInput(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
         return (update.dR, update.dt) if update.confidence is None else (update.dR, update.dt, update.confidence)
 
 

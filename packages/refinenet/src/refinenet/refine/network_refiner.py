@@ -14,13 +14,13 @@ from posecore import se3
 from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import Mesh
 
+from refinenet.batch import NetworkInput
 from refinenet.device import choose_device
 from refinenet.errors import RefinementError
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.image.edge_gradients import gradient_agreement
 from refinenet.models import checkpoint
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.models.networks import Pair
 from refinenet.refine.input_checks import require_trained
 from refinenet.refine.patches import Viewer, Views
 from refinenet.refiner import Frame, Refinement, Request, Status, require_meshes
@@ -281,7 +281,7 @@ class Refiner:
 
     def _forward(self, views: Views, T: Float[Array, "s 4 4"], first: int) -> PoseUpdate:
         part = slice(first, first + self._batch)
-        pair = Pair(
+        pair = NetworkInput(
             scene_rgb=self._tensor(views.scene_rgb[part].transpose(0, 3, 1, 2)),
             hypothesis_rgb=self._tensor(views.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
             T_cam_obj=self._tensor(T[part].astype(np.float32)),

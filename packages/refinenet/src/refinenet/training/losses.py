@@ -1,48 +1,16 @@
 """Losses between a predicted pose update and the truth: contour, point, flow and regression, all per sample."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
+from refinenet.batch import LossTarget
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.geometry.symmetry import ObjectPoints, nearest_by_rotation
 from refinenet.models.flow_solver import offsets_to_px, weighted
-
-
-class Target(NamedTuple):
-    """What a loss compares an update with.
-
-    Attributes:
-        T_cam_obj: (b, 4, 4) truth, metres.
-        T_cam_obj_hypothesis: (b, 4, 4) pose the update starts from.
-        K_crop: (b, 3, 3) intrinsics of the patch.
-        scene_contour_m: (b, n, 3) contour points of the scene's object, camera frame.
-        hypothesis_contour_m: (b, n, 3) contour points of the hypothesis, camera frame.
-        scene_distance_px: (b, p, p) distance transform of the scene's contour.
-        hypothesis_distance_px: (b, p, p) distance transform of the hypothesis' contour.
-        object_index: (b,) row of each sample's object in `ObjectPoints`.
-        scene_bits: (b, p, p) the scene's masks in the patch, bits as in shards' `scene_mask`; None where not known.
-        overlap: (b,) how well the hypothesis' silhouette fits what is visible, see `visibility.visible_overlap`.
-    """
-
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    T_cam_obj_hypothesis: Float[Tensor, "b 4 4"]
-    K_crop: Float[Tensor, "b 3 3"]
-    scene_contour_m: Float[Tensor, "b n 3"]
-    hypothesis_contour_m: Float[Tensor, "b n 3"]
-    scene_distance_px: Float[Tensor, "b p p"]
-    hypothesis_distance_px: Float[Tensor, "b p p"]
-    object_index: Int[Tensor, " b"]
-    scene_bits: UInt8[Tensor, "b p p"] | None = None
-    overlap: Float[Tensor, " b"] | None = None
-
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Target":
-        """Every field that is there, changed."""
-        return Target(*(x if x is None else change(x) for x in self))  # type: ignore[arg-type]
 
 
 def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:
@@ -61,7 +29,7 @@ def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b
     return value[:, 0, 0] + torch.linalg.vector_norm(uv_px - inside, dim=-1)
 
 
-def forward_contour_loss_px(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+def forward_contour_loss_px(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
     """Mean scene distance of the hypothesis' contour points, moved by the update and projected; patch pixels.
 
     Source: Manhardt et al., Deep Model-Based 6D Pose Refinement in RGB, ECCV 2018, Eq. 3, about the object's origin.
@@ -71,7 +39,7 @@ def forward_contour_loss_px(update: PoseUpdate, target: Target) -> Float[Tensor,
     return sample_distance(target.scene_distance_px, poses.project(target.K_crop, moved)).mean(-1)
 
 
-def contour_loss_px(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+def contour_loss_px(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
     """Contour loss in both directions, sum of two means, patch pixels.
 
     At the true update both terms vanish up to the contour's discretisation (half a pixel) for translations and turns
@@ -87,7 +55,7 @@ def contour_loss_px(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
     return forward_contour_loss_px(update, target) + backward
 
 
-def mse_loss(update: PoseUpdate, target: Target, gamma: float) -> Float[Tensor, " b"]:
+def mse_loss(update: PoseUpdate, target: LossTarget, gamma: float) -> Float[Tensor, " b"]:
     """Distance of unit quaternions plus gamma times the distance of translations in metres (paper, Eq. 2)."""
     true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     quat = poses.quat_wxyz_from_rotation(update.dR) - poses.quat_wxyz_from_rotation(true.dR)
@@ -95,7 +63,7 @@ def mse_loss(update: PoseUpdate, target: Target, gamma: float) -> Float[Tensor, 
 
 
 def point_loss_px(
-    update: PoseUpdate, target: Target, objects: ObjectPoints, rotation_weight: float = 1.0
+    update: PoseUpdate, target: LossTarget, objects: ObjectPoints, rotation_weight: float = 1.0
 ) -> Float[Tensor, " b"]:
     """Disentangled point loss: rotation, image-plane position and depth, each with the other two at their truth.
 
@@ -122,7 +90,7 @@ def point_loss_px(
     return (rotation_weight * rotation_m + plane_m + depth_m) * px_per_m
 
 
-def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
+def flow_loss(update: PoseUpdate, target: LossTarget, objects: ObjectPoints) -> Float[Tensor, " b"]:
     """Mean negative log likelihood of the true offsets of a hypothesis' visible surface, under `update.flow`.
 
     Offsets err by a Laplace distribution of two dimensions whose scales the network says, so that what it cannot see,
@@ -140,7 +108,7 @@ def flow_loss(update: PoseUpdate, target: Target, objects: ObjectPoints) -> Floa
     return cost.sum(-1) / flow.on_object.sum(-1).clamp(min=1)
 
 
-def closeness(target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
+def closeness(target: LossTarget, objects: ObjectPoints) -> Float[Tensor, " b"]:
     """How near hypotheses are to the truth as the camera sees it, in [0, 1]: 1 there, 1 / e `CLOSE` away.
 
     What counts is the mean distance of projected model points, as a share of the object's box diagonal at the truth's
@@ -157,13 +125,13 @@ def closeness(target: Target, objects: ObjectPoints) -> Float[Tensor, " b"]:
     return torch.exp(-torch.linalg.vector_norm(uv_px - true_px, dim=-1).mean(-1) / (CLOSE * size_px))
 
 
-def wanted_confidence(name: str, target: Target, objects: ObjectPoints | None) -> Float[Tensor, " b"]:
+def wanted_confidence(name: str, target: LossTarget, objects: ObjectPoints | None) -> Float[Tensor, " b"]:
     """What a confidence is to say of hypotheses: their visible overlap, or their closeness."""
     if name == "closeness":
         assert objects is not None
         return closeness(target, objects)
-    assert target.overlap is not None
-    return target.overlap
+    assert target.visible_iou is not None
+    return target.visible_iou
 
 
 def confidence_loss(update: PoseUpdate, wanted: Float[Tensor, " b"]) -> Float[Tensor, " b"]:
@@ -190,7 +158,7 @@ def make_loss(
     confidence_target: str = "overlap",
     min_closeness: float = 0.0,
     objects: ObjectPoints | None,
-) -> Callable[[PoseUpdate, Target], Float[Tensor, " b"]]:
+) -> Callable[[PoseUpdate, LossTarget], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
 
     Args:
@@ -205,15 +173,15 @@ def make_loss(
             without.
     """
 
-    def flow(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+    def flow(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
         assert objects is not None
         return flow_loss(update, target, objects)
 
-    def points(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+    def points(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
         assert objects is not None
         return point_loss_px(update, target, objects, rotation_weight)
 
-    def twin(update: PoseUpdate, target: Target) -> Target:
+    def twin(update: PoseUpdate, target: LossTarget) -> LossTarget:
         """What contours are compared with: they look alike at every twin, and their poses must not differ."""
         if objects is None or not objects.symmetric:
             return target
@@ -221,10 +189,10 @@ def make_loss(
         T_true = nearest_by_rotation(predicted, target.T_cam_obj, target.object_index, objects)
         return target._replace(T_cam_obj=T_true)
 
-    def contour(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+    def contour(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
         return contour_loss_px(update, twin(update, target))
 
-    table: dict[str, Callable[[PoseUpdate, Target], Float[Tensor, " b"]]] = {
+    table: dict[str, Callable[[PoseUpdate, LossTarget], Float[Tensor, " b"]]] = {
         "contour": contour,
         "contour-forward": forward_contour_loss_px,
         "mse": lambda update, target: mse_loss(update, target, gamma),
@@ -234,7 +202,7 @@ def make_loss(
     }
     pose = table[name]
 
-    def loss(update: PoseUpdate, target: Target) -> Float[Tensor, " b"]:
+    def loss(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
         value = pose(update, target)
         if min_closeness > 0:
             assert objects is not None

@@ -21,16 +21,15 @@ from posecore.shard import BIT_OBJECT
 from posecore.window import Window
 from torch import Tensor, nn
 
+from refinenet.batch import Batch, LossTarget, NetworkInput
 from refinenet.config import OwnPredictionsConfig, TrainConfig
 from refinenet.data.objects import for_patches
 from refinenet.data.online_pairs import MIN_CONTOUR_PX
-from refinenet.data.pair_stream import Batch
 from refinenet.data.split import OWN
 from refinenet.geometry import poses
 from refinenet.image.crops import hypothesis_window
 from refinenet.image.masks import visible_overlap
-from refinenet.models.networks import Pair
-from refinenet.training.losses import Target, sample_distance
+from refinenet.training.losses import sample_distance
 
 Array = np.ndarray
 FARTHEST_SIDE = 2.0
@@ -128,7 +127,7 @@ class OwnPredictions:
     ) -> tuple[Batch, Int[Array, " s"]]:
         """The batch after one update of some rows, and those of them that could be looked at where they went."""
         chosen = torch.from_numpy(rows).to(batch.sample_ids.device)
-        pair = batch.pair.mapped(lambda x: x[chosen])
+        pair = batch.inputs.mapped(lambda x: x[chosen])
         with torch.autocast(chosen.device.type, torch.bfloat16, enabled=self._reduced):
             update = network(pair)
         T = poses.apply_update(pair.T_cam_obj, update).double().cpu().numpy()
@@ -139,17 +138,17 @@ class OwnPredictions:
             return batch, rows[:0]
         where = chosen[torch.from_numpy(looks.kept).to(chosen.device)]
         colours = None if batch.render_colours is None else batch.render_colours[rows[looks.kept]]
-        new = self._pairs(looks, batch.pair.mapped(lambda x: x[where]), batch.target.mapped(lambda x: x[where]), rng)
-        new = new._replace(pair=new.pair._replace(hypothesis_rgb=_tinted(looks.rgb, colours).to(chosen.device)))
+        new = self._pairs(looks, batch.inputs.mapped(lambda x: x[where]), batch.target.mapped(lambda x: x[where]), rng)
+        new = new._replace(inputs=new.inputs._replace(hypothesis_rgb=_tinted(looks.rgb, colours).to(chosen.device)))
 
         def put(old: tuple[Tensor | None, ...], moved: tuple[Tensor | None, ...]) -> list[Tensor | None]:
             both = zip(old, moved, strict=True)
             return [x if x is None or y is None else x.index_copy(0, where, y) for x, y in both]
 
-        pairs, targets = Pair(*put(batch.pair, new.pair)), Target(*put(batch.target, new.target))  # type: ignore[arg-type]
-        return batch._replace(pair=pairs, target=targets), rows[looks.kept]
+        inputs, targets = NetworkInput(*put(batch.inputs, new.inputs)), LossTarget(*put(batch.target, new.target))  # type: ignore[arg-type]
+        return batch._replace(inputs=inputs, target=targets), rows[looks.kept]
 
-    def _look(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: Target) -> _Looks | None:
+    def _look(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: LossTarget) -> _Looks | None:
         """What poses look like through windows of their own; None where none of them can be seen."""
         assert target.scene_bits is not None  # every stream fills it
         K, index = K_crop.double().cpu().numpy(), target.object_index.cpu().numpy()
@@ -180,7 +179,7 @@ class OwnPredictions:
             scale=np.array([patch_px / cut[j].side_px for j in good]),
         )  # fmt: skip
 
-    def _pairs(self, looks: _Looks, pair: Pair, target: Target, rng: np.random.Generator) -> Batch:
+    def _pairs(self, looks: _Looks, pair: NetworkInput, target: LossTarget, rng: np.random.Generator) -> Batch:
         """The pairs of what was looked at, made of the old ones; renders' colours are as drawn."""
 
         def real(values: Array | list[Array]) -> Tensor:
@@ -193,7 +192,7 @@ class OwnPredictions:
         ]
         scene = _resampled(pair.scene_rgb.float(), looks.uv_px, "bilinear")
         distance = sample_distance(target.scene_distance_px, looks.uv_px.flatten(1, 2))
-        new_pair = Pair(
+        new_pair = NetworkInput(
             scene_rgb=(scene + 0.5).clamp(0, 255).byte(), hypothesis_rgb=pair.hypothesis_rgb,
             T_cam_obj=real(looks.T_cam_obj), K_crop=real(looks.K_crop),
             hypothesis_depth_m=None if pair.hypothesis_depth_m is None else real(looks.depth_m),
@@ -205,7 +204,7 @@ class OwnPredictions:
             scene_distance_px=distance.unflatten(1, (patch_px, patch_px)) * real(looks.scale)[:, None, None],
             hypothesis_distance_px=real([contour.distance_transform_px(outline) for outline in looks.outline]),
             scene_bits=torch.from_numpy(looks.bits).to(pair.K_crop.device),
-            overlap=None if target.overlap is None else real(visible_overlap(masks, looks.bits)),
+            visible_iou=None if target.visible_iou is None else real(visible_overlap(masks, looks.bits)),
         )
         return Batch(new_pair, new_target, torch.from_numpy(looks.kept))
 

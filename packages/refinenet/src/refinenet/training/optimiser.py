@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from refinenet.batch import Batch
 from refinenet.config import OptimiserConfig
-from refinenet.data.pair_stream import Batch
 from refinenet.errors import TrainingError
 
 

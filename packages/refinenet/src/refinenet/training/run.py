@@ -18,17 +18,18 @@ from posecore.shard import ShardReader, load_meshes, n_shards
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
+from refinenet.batch import Batch, NetworkInput
 from refinenet.config import TrainConfig
 from refinenet.data.growing_split import Growth, wait_for_dataset, wait_for_start
 from refinenet.data.loader import make_loader, on_device
 from refinenet.data.objects import load_models, object_ids, object_points
-from refinenet.data.pair_stream import Batch, PairStream
+from refinenet.data.pair_stream import PairStream
 from refinenet.data.split import DataRecord, Split, divide, held_out_scenes, read_scenes
 from refinenet.data.validation_set import HeldOut
 from refinenet.device import choose_device
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.models import checkpoint, inception
-from refinenet.models.networks import Pair, PaperNet, make_network
+from refinenet.models.networks import PaperNet, make_network
 from refinenet.training import validation
 from refinenet.training.losses import PIXEL_LOSSES, make_loss
 from refinenet.training.on_policy import OwnPredictions
@@ -258,7 +259,7 @@ class Trainer:
             batch = self._own_predictions(self.network, batch.to(self.device), self.step, i)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-                    update = self._predict(batch.pair)
+                    update = self._predict(batch.inputs)
                 losses.append(self._loss(update, batch.target))
                 (losses[-1].mean() / len(batches)).backward()
         weights = [p for p in self.network.parameters() if p.grad is not None]
@@ -274,11 +275,11 @@ class Trainer:
             self._average.update(self.step)
         self.step += 1
         loss = torch.stack([values.detach().mean() for values in losses]).mean()
-        shares = [batch.visible_share for batch in batches if batch.visible_share is not None]
+        shares = [batch.visible_fraction for batch in batches if batch.visible_fraction is not None]
         told = {"visible_share": torch.stack([share.mean() for share in shares]).mean()} if shares else {}
         return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm, **told}
 
-    def _predict(self, pair: Pair) -> PoseUpdate:
+    def _predict(self, pair: NetworkInput) -> PoseUpdate:
         if not self.config.compile:
             return self._forward(pair)
         try:

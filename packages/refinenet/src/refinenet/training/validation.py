@@ -13,7 +13,7 @@ from posecore.files import storage_error, write_atomic
 from torch import Tensor, nn
 from torch.utils.tensorboard import SummaryWriter
 
-from refinenet.data.pair_stream import Batch
+from refinenet.batch import Batch
 from refinenet.geometry import poses
 from refinenet.geometry.symmetry import ObjectPoints, nearest_by_angle, nearest_by_points
 from refinenet.training.losses import closeness, wanted_confidence
@@ -68,7 +68,7 @@ def measure(
     for batch in batches:
         batch = batch.to(device)
         counted.append(closeness(batch.target, objects).cpu() >= min_closeness)
-        start, update = batch.pair.T_cam_obj, network(batch.pair)
+        start, update = batch.inputs.T_cam_obj, network(batch.inputs)
         if update.confidence is not None:
             wanted = wanted_confidence(confidence_target, batch.target, objects)
             off.append((torch.sigmoid(update.confidence) - wanted).abs().cpu())
