@@ -69,8 +69,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2500)
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
-    changes = ["hypothesis.fresh=false", f"steps={arguments.steps}", f"validation.every={arguments.steps}"]
-    changes += [f"threads={arguments.threads}", "validation.scene_share=0.02"]
+    changes = ["hypothesis.online=false", f"steps={arguments.steps}", f"validation.every={arguments.steps}"]
+    changes += [f"threads={arguments.threads}", "validation.scene_fraction=0.02"]
     config = load_config("compact", changes)
     results = []
     with tempfile.TemporaryDirectory() as folder:

@@ -17,10 +17,11 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import get_args
 
 import torch
 from refinenet.batch import Batch
-from refinenet.config import PRESETS, load_config
+from refinenet.config import PresetName, load_config
 from refinenet.training.run import Trainer
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -32,7 +33,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shards", help="dataset of `synthgen render`, folder or URL")
-    parser.add_argument("--preset", choices=PRESETS, default="compact")
+    parser.add_argument("--preset", choices=get_args(PresetName), default="compact")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--steps", type=int, default=20, help="steps of a block")
     parser.add_argument("--rounds", type=int, default=5, help="blocks of each kind")

@@ -10,8 +10,8 @@ from posecore.bop.models_info import save_models_info
 from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
-from refinenet.data.growing_split import Growth, wait_for_start
-from refinenet.data.split import OTHER_OBJECT, DataRecord, divide, drawn_out, held_out_scenes, read_scenes
+from refinenet.data.growing_split import GrowingSplit, wait_for_start
+from refinenet.data.split import OTHER_OBJECT, DataRecord, divide, drawn_out, read_scenes, validation_scenes
 from refinenet.models.checkpoint import load
 from refinenet.training.loop import train
 from refinenet.training.run import Trainer
@@ -42,9 +42,9 @@ def test_only_the_chosen_objects_scenes_are_split(two_objects):
     scene_of, _ = read_scenes(reader, reader.committed, objects=(2,))
     flat = np.concatenate(list(scene_of.values()))
     assert set(flat) == {OTHER_OBJECT, *range(1, 24, 2)}
-    held_out = held_out_scenes(reader.url, scene_of, 0.25, 0)
-    assert len(held_out) == 3 and (held_out % 2 == 1).all()
-    training, validation = divide(scene_of, held_out)
+    scenes = validation_scenes(reader.url, scene_of, 0.25, 0)
+    assert len(scenes) == 3 and (scenes % 2 == 1).all()
+    training, validation = divide(scene_of, scenes)
     assert (training.scenes, validation.scenes) == (9, 3)
     assert (training.n, validation.n) == (18, 6)
 
@@ -54,7 +54,7 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     run = Trainer(config, str(two_objects), tmp_path / "look")
     for batch in itertools.islice(run.stream(), 12):
         assert (batch.target.object_index == 1).all()
-    assert all((batch.target.object_index == 1).all() for batch in run._held_out.batches)
+    assert all((batch.target.object_index == 1).all() for batch in run._validation_set.batches)
     run.close()
     train(config, str(two_objects), tmp_path / "run")
     assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
@@ -63,12 +63,12 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
 def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
     config = small("objects=[1]", "batch=4", "steps=8", "loader.follow=true", "loader.workers=0")
     train(config, str(two_objects), tmp_path / "run")
-    held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
-    assert all(scene % 2 == 0 for scene in held_out)
+    scenes = json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"]
+    assert all(scene % 2 == 0 for scene in scenes)
     # A run that began with two shards: the others join in its second epoch.
     (tmp_path / "grown").mkdir()
-    record = DataRecord(shards=(0, 1), held_out=(0,))
-    growth = Growth(out=tmp_path / "grown", record=record, config=config)
+    record = DataRecord(shards=(0, 1), validation_scenes=(0,))
+    growth = GrowingSplit(out=tmp_path / "grown", record=record, config=config)
     joined = next(growth.epochs(str(two_objects)))
     reader = ShardReader(str(two_objects))
     assert set(joined) == {*reader.committed} - {0, 1}
@@ -92,7 +92,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
         raise Waited
 
     monkeypatch.setattr("refinenet.data.growing_split.time.sleep", wait)
-    options = ["loader.follow=true", "seed=2", "validation.scene_share=0.1"]
+    options = ["loader.follow=true", "seed=2", "validation.scene_fraction=0.1"]
     wait_for_start(reader, small(*options, "objects=[1]"), 1)
     with pytest.raises(Waited):
         wait_for_start(reader, small(*options, "objects=[2]"), 1)

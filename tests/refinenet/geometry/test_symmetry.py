@@ -99,11 +99,11 @@ def target_of(T_true, T_hypothesis):
     return LossTarget(torch.from_numpy(T_true), torch.from_numpy(T_hypothesis), K, none, none, flat, flat, rows)
 
 
-def test_closeness_of_an_exact_pose_is_one(mesh):
+def test_pose_quality_of_an_exact_pose_is_one(mesh):
     rng = np.random.default_rng(5)
     info = MODELS["axis"]
     T_true = random_poses(rng)
-    close = losses.closeness(target_of(T_true, T_true @ turns(info, rng)), objects_with(mesh, info))
+    close = losses.pose_quality(target_of(T_true, T_true @ turns(info, rng)), objects_with(mesh, info))
     assert close.min() > 0.9999
 
 

@@ -21,7 +21,7 @@ from refinenet.models.networks import FlowNet, make_network
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Status
 from refinenet.training import losses, validation
-from refinenet.training.on_policy import OwnPredictions
+from refinenet.training.on_policy import OnPolicyHypotheses
 from refinenet.training.run import Trainer
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
@@ -239,13 +239,13 @@ def se3_moved(T, moves):
     return turned
 
 
-def test_closeness_is_one_at_the_truth_and_falls_with_what_is_seen_of_the_error(scenes, mesh):
+def test_pose_quality_is_one_at_the_ground_truth_and_falls_with_the_visible_error(scenes, mesh):
     points = points_of(mesh)
     size_m = float((points.points_m.amax(1) - points.points_m.amin(1)).norm())
     still = np.zeros(3)
 
     def at(turn, move):
-        return losses.closeness(hypotheses_at(scenes, (turn, move)), points)
+        return losses.pose_quality(hypotheses_at(scenes, (turn, move)), points)
 
     torch.testing.assert_close(at(still, still), torch.ones(4, dtype=torch.float64))
     across = at(still, [losses.CLOSE * size_m, 0.0, 0.0])
@@ -260,16 +260,18 @@ def test_the_nearest_twin_is_as_close(scenes, mesh):
     half_turn = se3.make_T(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     target = targets(scenes)
     turned = target._replace(T_cam_obj_hypothesis=target.T_cam_obj @ torch.from_numpy(half_turn))
-    torch.testing.assert_close(losses.closeness(turned, points_of(mesh, half_turn)), torch.ones(4, dtype=torch.float64))
-    assert (losses.closeness(turned, points_of(mesh)) < 0.5).all()
+    torch.testing.assert_close(
+        losses.pose_quality(turned, points_of(mesh, half_turn)), torch.ones(4, dtype=torch.float64)
+    )
+    assert (losses.pose_quality(turned, points_of(mesh)) < 0.5).all()
 
 
 def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
     """Cross-entropy is least for the confidence that says just that."""
     target = targets(scenes)._replace(visible_iou=torch.full((4,), 0.25, dtype=torch.float64))
-    close = losses.closeness(target, points_of(mesh))
+    close = losses.pose_quality(target, points_of(mesh))
     update = solved(true_flow(*scenes), scenes[1], scenes[2], mesh)
-    for name, wanted in (("overlap", target.visible_iou), ("closeness", close)):
+    for name, wanted in (("visible_iou", target.visible_iou), ("pose_quality", close)):
         cost = losses.make_loss(
             "flow+point", gamma=1.0, point_weight=0.0, confidence_target=name, objects=points_of(mesh)
         )
@@ -298,15 +300,15 @@ def batch_of(dataset, config, training=True, n=8):
 
 
 def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh):
-    fresh = batch_of(dataset, flow_config())
+    online = batch_of(dataset, flow_config())
     assert batch_of(dataset, small()).inputs.hypothesis_depth_m is None
-    config = flow_config("own_predictions.share=1", "own_predictions.begin=0", "own_predictions.full=0")
-    with OwnPredictions(config, {1: mesh}) as own:
-        moved = own(Moves(), fresh, step=3)
-    shape = [batch.inputs.hypothesis_depth_m > 0 for batch in (fresh, moved)]
+    config = flow_config("on_policy.fraction=1", "on_policy.begin=0", "on_policy.full=0")
+    with OnPolicyHypotheses(config, {1: mesh}) as own:
+        moved = own(Moves(), online, step=3)
+    shape = [batch.inputs.hypothesis_depth_m > 0 for batch in (online, moved)]
     assert (shape[0] != shape[1]).float().mean() > 0.01
     with Rasteriser({1: mesh}) as rasteriser:
-        for batch in (fresh, moved):
+        for batch in (online, moved):
             pair = batch.inputs
             layers = rasteriser.render(1, pair.K_crop.double().numpy(), pair.T_cam_obj.double().numpy(), 64, 64)
             there = pair.hypothesis_depth_m.numpy()
@@ -316,7 +318,7 @@ def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh
 
 
 def test_stored_pairs_have_their_depth_too(dataset):
-    pairs = batch_of(dataset, flow_config("hypothesis.fresh=false", "window.kind=fixed")).inputs
+    pairs = batch_of(dataset, flow_config("hypothesis.online=false", "window.kind=fixed")).inputs
     mask = (pairs.hypothesis_rgb > 0).any(1)
     assert ((pairs.hypothesis_depth_m > 0) == mask).float().mean() > 0.99
 
@@ -395,7 +397,7 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
     assert 0 <= found.confidence <= 1
 
 
-@pytest.mark.parametrize(("target", "output"), [("overlap", True), ("closeness", True), ("closeness", False)])
+@pytest.mark.parametrize(("target", "output"), [("visible_iou", True), ("pose_quality", True), ("pose_quality", False)])
 def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target, output):
     says = [f"loss.confidence_target={target}"] if output else []
     config = flow_config(f"network.confidence={str(output).lower()}", "network.match_radius=1", *says)
@@ -404,7 +406,7 @@ def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, ta
     trainer.close()
     with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
         assert refiner.scorer == ("learned" if output else "gradient")
-        assert refiner.tells_closeness == (output and target == "closeness")
+        assert refiner.tells_closeness == (output and target == "pose_quality")
 
 
 class Unsure(torch.nn.Module):
@@ -418,24 +420,24 @@ class Unsure(torch.nn.Module):
 def test_validation_measures_the_confidence_against_what_it_is_to_say(dataset):
     batch, points = batch_of(dataset, flow_config("network.confidence=true")), points_of_dataset(dataset)
     errors = {}
-    for target in ("overlap", "closeness"):
+    for target in ("visible_iou", "pose_quality"):
         found = validation.measure(Unsure(), [batch], points, torch.device("cpu"), target)
         errors[target] = found["validation/confidence_error"]
-        wanted = losses.wanted_confidence(target, batch.target, points)
+        wanted = losses.confidence_targets(target, batch.target, points)
         assert errors[target] == pytest.approx(float((wanted - 0.5).abs().mean()), rel=1e-5)
-    assert abs(errors["overlap"] - errors["closeness"]) > 0.01
+    assert abs(errors["visible_iou"] - errors["pose_quality"]) > 0.01
 
 
 def test_what_the_loss_leaves_out_is_not_measured(dataset):
-    config = flow_config("network.confidence=true", "loss.min_closeness=0.2")
+    config = flow_config("network.confidence=true", "loss.min_pose_quality=0.2")
     batch, points = batch_of(dataset, config, training=False), points_of_dataset(dataset)
-    close = losses.closeness(batch.target, points)
+    close = losses.pose_quality(batch.target, points)
     counted = close >= 0.2
     assert 0 < counted.sum() < len(counted)
     before = validation.pose_errors(batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
 
     def measured(least):
-        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), "closeness", least)
+        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), "pose_quality", least)
 
     some, every, none = measured(0.2), measured(0.0), measured(0.999)
     assert some["validation/pairs"] == counted.sum()

@@ -260,7 +260,7 @@ def test_training_options_are_checked():
     ):
         load_config("paper", ["augment.occlusion=0.5"])
     with pytest.raises(ConfigError, match=r"begin is 0.7, expected 0 to full, which is 0.5"):
-        load_config("compact", ["own_predictions.begin=0.7"])
+        load_config("compact", ["on_policy.begin=0.7"])
     with pytest.raises(ConfigError, match=r"patch_px is 72, expected a multiple of 32 for kind=plus"):
         load_config("plus", ["network.patch_px=72"])
     config = load_config("paper", ["backbone.name=inception_v3", "backbone.pretrained=false", "steps=5"])

@@ -169,13 +169,13 @@ def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
 
 def test_what_is_far_off_teaches_the_confidence_alone(mesh, turned):
     objects = object_points(mesh)
-    close = losses.closeness(turned, objects)
+    close = losses.pose_quality(turned, objects)
     limit = float(close.median())
     b = len(close)
     still = identity(turned)._replace(confidence=torch.zeros(b, dtype=torch.float64))
-    settings = {"gamma": 1, "point_weight": 1, "confidence_target": "closeness", "objects": objects}
+    settings = {"gamma": 1, "point_weight": 1, "confidence_target": "pose_quality", "objects": objects}
     plain, limited = (
-        losses.make_loss("point", **settings, min_closeness=least)(still, turned) for least in (0.0, limit)
+        losses.make_loss("point", **settings, min_pose_quality=least)(still, turned) for least in (0.0, limit)
     )
     alone = losses.confidence_loss(still, close)
     far = close < limit

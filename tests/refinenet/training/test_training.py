@@ -16,7 +16,7 @@ from refinenet.training.validation import MetricLog
 from safetensors.torch import load_file
 
 SMALL = [
-    "batch=8", "loader.workers=0", "loader.shuffle_shards=2", "loss.contour_points=32", "validation.scene_share=0.2",
+    "batch=8", "loader.workers=0", "loader.shuffle_shards=2", "loss.contour_points=32", "validation.scene_fraction=0.2",
     "validation.pairs=8", "validation.every=4", "checkpoint_every=2", "log_every=1", "threads=1", "steps=6",
     "network.encoder=[8, 8]", "network.widths=[16, 16]", "network.hidden=32",
 ]  # fmt: skip
@@ -84,8 +84,8 @@ def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_pat
         train(small(), str(dataset), out)
     with pytest.raises(ConfigError, match=r"seed was 0 and is now 1; resume with the same settings"):
         train(small("seed=1"), str(dataset), out, resume=True)
-    with pytest.raises(ConfigError, match=r"validation.scene_share was 0.2 and is now 0.4"):
-        train(small("validation.scene_share=0.4"), str(dataset), out, resume=True)
+    with pytest.raises(ConfigError, match=r"validation.scene_fraction was 0.2 and is now 0.4"):
+        train(small("validation.scene_fraction=0.4"), str(dataset), out, resume=True)
     with pytest.raises(CheckpointError, match="no run to resume"):
         train(small(), str(dataset), tmp_path, resume=True)
     with pytest.raises(CheckpointError, match="a checkpoint of preset compact, expected preset paper"):

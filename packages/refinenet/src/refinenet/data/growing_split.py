@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Growth:
+class GrowingSplit:
     """Takes new shards of a growing dataset into a run, an epoch at a time.
 
     Attributes:
@@ -73,7 +73,7 @@ class Growth:
         begun = (self.out / GROWTH).glob("epoch-*.json")
         return {shard for path in begun for shard in json.loads(path.read_text())["shards"]}
 
-    def held_out(self, url: str, shards: Collection[int]) -> tuple[set[int], dict[int, Array]]:
+    def validation_rows(self, url: str, shards: Collection[int]) -> tuple[set[int], dict[int, Array]]:
         """Those of some shards that can be read, and their held-out rows by shard.
 
         Raises:
@@ -89,8 +89,8 @@ class Growth:
         return read_scenes(reader, shards, skip=skip, objects=objects)[0]
 
     def _divide(self, scene_of: Mapping[int, Array]) -> tuple[Split, Split]:
-        drawn = drawn_out(scenes_in(scene_of), self.config.validation.scene_share, self.config.seed)
-        return divide(scene_of, np.union1d(self.record.held_out, drawn))
+        drawn = drawn_out(scenes_in(scene_of), self.config.validation.scene_fraction, self.config.seed)
+        return divide(scene_of, np.union1d(self.record.validation_scenes, drawn))
 
 
 def wait_for_dataset(url: str) -> None:
@@ -121,7 +121,7 @@ def wait_for_start(reader: ShardReader, config: TrainConfig, wanted: int) -> Non
     while not reader.complete:
         new = sorted({*reader.committed} - set(scene_of))
         scene_of |= read_scenes(reader, new, skip=config.loader.skip_bad_shards, objects=config.objects)[0]
-        drawn = drawn_out(scenes_in(scene_of), config.validation.scene_share, config.seed)
+        drawn = drawn_out(scenes_in(scene_of), config.validation.scene_fraction, config.seed)
         training, held = divide(scene_of, drawn)
         if len(training.rows) >= wanted and held.scenes:
             return

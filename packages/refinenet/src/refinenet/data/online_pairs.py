@@ -20,7 +20,7 @@ from posecore.window import Window
 
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig
 from refinenet.image import augmentation
-from refinenet.image.crops import hypothesis_window, optical_axis_turn, recut_affine, warp
+from refinenet.image.crops import crop_affine, hypothesis_window, optical_axis_turn, warp
 from refinenet.image.masks import visible_overlap, visible_share
 
 Array = np.ndarray
@@ -97,7 +97,7 @@ def draw_hypothesis(
         rng: Source of every draw.
         reach: Factor on both ends.
     """
-    turn, move = (rng.random() if rng.random() < config.easy_share else 1.0 for _ in range(2))
+    turn, move = (rng.random() if rng.random() < config.easy_fraction else 1.0 for _ in range(2))
     angle_rad = np.deg2rad(config.max_angle_deg) * reach * turn * rng.random()
     distance_m = config.max_translation_diameter * diameter_m * reach * move * rng.random()
     drawn = se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
@@ -114,9 +114,9 @@ class PairMaker:
         window: How windows are cut.
         fixed_sides_px: Side of each object's window in the full image, for windows of fixed side.
         contour_points: Contour points of each patch.
-        hypothesis: How hypotheses are drawn; with `fresh` off the stored ones are taken, else by `stored_share`.
+        hypothesis: How hypotheses are drawn; precomputed ones without `online`, else by `precomputed_fraction`.
         augment_config: Colour augmentation.
-        symmetries: Transforms of each object that leave it as it is, for `hypothesis.any_twin`.
+        symmetries: Transforms of each object that leave it as it is, for `hypothesis.sample_symmetries`.
     """
 
     def __init__(
@@ -195,17 +195,17 @@ class PairMaker:
     def _draft(self, index: int, sample: Mapping[str, Any], rng: np.random.Generator) -> _Draft | None:
         """Pose, window and scene labels of one pair; None when the scene's contour cannot be seen in any window."""
         mesh = self._meshes[int(sample["obj_id"])]
-        in_plane = self._hypothesis.fresh and self._hypothesis.in_plane
+        in_plane = self._hypothesis.online and self._hypothesis.in_plane
         turn = optical_axis_turn(rng.uniform(-np.pi, np.pi) if in_plane else 0.0)
         T_turn = se3.make_T(turn, np.zeros(3))
         truth = T_turn @ sample["T_cam_obj"]
         x0, y0, side = (float(v) for v in sample["window_px"])
         stored, stored_px = Window(x0_px=x0, y0_px=y0, side_px=side), len(sample["scene_rgb"])
-        share = self._hypothesis.stored_share
-        stored_first = not self._hypothesis.fresh or (share > 0 and rng.random() < share)
+        share = self._hypothesis.precomputed_fraction
+        stored_first = not self._hypothesis.online or (share > 0 and rng.random() < share)
         for attempt in range(ATTEMPTS):
-            if self._hypothesis.fresh and not (stored_first and attempt == 0):
-                around = self._twin(truth, int(sample["obj_id"]), rng) if self._hypothesis.any_twin else truth
+            if self._hypothesis.online and not (stored_first and attempt == 0):
+                around = self._twin(truth, int(sample["obj_id"]), rng) if self._hypothesis.sample_symmetries else truth
                 guess = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
             else:
                 guess = T_turn @ sample["T_cam_obj_hypothesis"]
@@ -213,7 +213,7 @@ class PairMaker:
                 continue
             fixed_px = self._fixed_sides_px.get(int(sample["obj_id"]), stored.side_px)
             window = hypothesis_window(self._window, sample["K"], guess, mesh, fixed_px)
-            affine = recut_affine(stored, stored_px, sample["K"], turn, window, self._patch_px)
+            affine = crop_affine(stored, stored_px, sample["K"], turn, window, self._patch_px)
             bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
             valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
             # Where the stored patch ends the silhouette is cut, which is no contour: outside counts as object.
@@ -247,14 +247,14 @@ class PairMaker:
         if exchange or not draft.valid.all():
             other = samples[int(rng.integers(len(samples)))]
             foreground = (other["scene_mask"] & BIT_FOREGROUND) > 0
-            behind = augmentation.backdrop(other["scene_rgb"], foreground, self._patch_px, rng)
+            behind = augmentation.background_patch(other["scene_rgb"], foreground, self._patch_px, rng)
             keep = draft.valid & ((bits & BIT_FOREGROUND) > 0) if exchange else draft.valid
             # The stored window's edge must not show: centred near the truth, it would give the answer away.
             scene = np.where(keep[..., None], scene, behind)
         if self._augment.occlusion and rng.random() < self._augment.occlusion:
             other = samples[int(rng.integers(len(samples)))]
             scene, bits = augmentation.occlude(
-                scene, bits, other["scene_rgb"], other["scene_mask"], self._augment.occlusion_leaves, rng
+                scene, bits, other["scene_rgb"], other["scene_mask"], self._augment.min_visible_fraction, rng
             )
         return scene, bits
 

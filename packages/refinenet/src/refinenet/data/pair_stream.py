@@ -19,15 +19,15 @@ from torch.utils.data import IterableDataset, get_worker_info
 
 from refinenet.batch import Batch, LossTarget, NetworkInput
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
-from refinenet.data.growing_split import Growth
+from refinenet.data.growing_split import GrowingSplit
 from refinenet.data.objects import for_patches, load_models, symmetries_of
 from refinenet.data.online_pairs import PairArrays, PairMaker
+from refinenet.data.precomputed_pairs import PRECOMPUTED_FIELDS, precomputed_pairs
 from refinenet.data.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
-from refinenet.data.stored_pairs import STORED_FIELDS, stored_pairs
 from refinenet.image.crops import fixed_sides_px
 
 Array = np.ndarray
-RECUT_FIELDS = (
+ONLINE_FIELDS = (
     "scene_rgb", "scene_mask", "scene_contour_cam_m", "T_cam_obj", "T_cam_obj_hypothesis", "K", "window_px", "obj_id",
 )  # fmt: skip
 
@@ -50,7 +50,7 @@ class PairSource:
         self._bad: dict[int, str] = {}
         self._untold: list[str] = []
         self._rasteriser: Rasteriser | None = None
-        if config.recut:
+        if config.makes_pairs_online:
             meshes = load_meshes(self.reader)
             self._rasteriser = Rasteriser(for_patches(meshes, config.network.patch_px))
             self._make = PairMaker(
@@ -78,8 +78,8 @@ class PairSource:
         Raises:
             ShardError: One cannot be read, without that setting.
         """
-        fields: tuple[str, ...] = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
-        if self._rasteriser is None and (self._config.network.confidence or self._config.network.sees_depth):
+        fields: tuple[str, ...] = ONLINE_FIELDS if self._rasteriser is not None else PRECOMPUTED_FIELDS
+        if self._rasteriser is None and (self._config.network.confidence or self._config.network.uses_depth):
             fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:
             self.reader.refresh()
@@ -110,12 +110,12 @@ class PairSource:
         """
         rngs = [np.random.default_rng([self._config.seed, SAMPLE, *key]) for key in keys]
         if self._rasteriser is None:
-            arrays: PairArrays | None = stored_pairs(samples, rngs, self._config, self._augment, self.reader.url)
+            arrays: PairArrays | None = precomputed_pairs(samples, rngs, self._config, self._augment, self.reader.url)
         else:
             arrays = self._make(samples, rngs)
         if arrays is None:
             return None
-        if not self._config.network.sees_depth:
+        if not self._config.network.uses_depth:
             arrays = replace(arrays, hypothesis_depth_m=None)
         batch = _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
         told, self._untold = tuple(self._untold), []
@@ -128,7 +128,7 @@ def _bytes(arrays: dict[str, Array]) -> int:
 
 def _steady(config: TrainConfig) -> HypothesisConfig:
     """Hypotheses for validation: over the whole range, none of the stored ones beside them, scenes as they are."""
-    return replace(config.hypothesis, easy_share=0.0, stored_share=0.0, in_plane=False)
+    return replace(config.hypothesis, easy_fraction=0.0, precomputed_fraction=0.0, in_plane=False)
 
 
 def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: dict[int, int]) -> Batch:
@@ -181,7 +181,7 @@ class PairStream(IterableDataset[Batch]):
     world: int = 1
     workers: int = 1
     start: int = 0
-    growth: Growth | None = None
+    growth: GrowingSplit | None = None
 
     def __post_init__(self) -> None:
         slots = self.world * self.workers

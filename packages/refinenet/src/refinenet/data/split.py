@@ -15,6 +15,8 @@ from posecore.errors import CheckpointError, ShardError
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
 
+from refinenet.models.migration import migrated_record
+
 Array = np.ndarray
 ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, OWN = range(6)
 """First key of each random stream, so that no two streams of a run share draws."""
@@ -47,11 +49,11 @@ class DataRecord:
 
     Attributes:
         shards: shards that were there.
-        held_out: scenes that are measured on and never trained on.
+        validation_scenes: scenes that are validated on and never trained on.
     """
 
     shards: tuple[int, ...]
-    held_out: tuple[int, ...]
+    validation_scenes: tuple[int, ...]
 
     def save(self, out: Path) -> None:
         """Write it into a run's folder, and drop what an earlier run left of a growing dataset.
@@ -60,7 +62,7 @@ class DataRecord:
             StorageError: No rights or no space.
         """
         shutil.rmtree(out / GROWTH, ignore_errors=True)
-        text = json.dumps({"shards": self.shards, "held_out_scenes": self.held_out})
+        text = json.dumps({"shards": self.shards, "validation_scenes": self.validation_scenes})
         write_atomic(out / RECORD, text.encode())
 
     @classmethod
@@ -71,8 +73,8 @@ class DataRecord:
             CheckpointError: It is missing or damaged.
         """
         try:
-            found = json.loads((out / RECORD).read_text())
-            return cls(shards=tuple(found["shards"]), held_out=tuple(found["held_out_scenes"]))
+            record = migrated_record(json.loads((out / RECORD).read_text()))
+            return cls(shards=tuple(record["shards"]), validation_scenes=tuple(record["validation_scenes"]))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise CheckpointError(
                 f"{out / RECORD}: missing or damaged ({type(error).__name__}), so nobody knows which scenes this run "
@@ -110,7 +112,7 @@ def read_scenes(
     return scenes, bad
 
 
-def held_out_scenes(
+def validation_scenes(
     url: str, scene_of: Mapping[int, Array], share: float, seed: int, *, growing: bool = False
 ) -> Array:
     """Scenes to hold out, at least one.

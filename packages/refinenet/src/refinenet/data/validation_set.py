@@ -7,12 +7,12 @@ from posecore.errors import ShardError
 
 from refinenet.batch import Batch
 from refinenet.config import TrainConfig
-from refinenet.data.growing_split import Growth
+from refinenet.data.growing_split import GrowingSplit
 from refinenet.data.pair_stream import PairSource
 from refinenet.data.split import Split, spread_rows
 
 
-class HeldOut:
+class ValidationSet:
     """The pairs that a run is measured on, without a GL context of their own once they are made.
 
     Of a growing dataset more of them join, until there are as many as the configuration asks for.
@@ -34,7 +34,7 @@ class HeldOut:
     """
 
     def __init__(
-        self, url: str, config: TrainConfig, split: Split, growth: Growth | None, joined: Collection[int] = ()
+        self, url: str, config: TrainConfig, split: Split, growth: GrowingSplit | None, joined: Collection[int] = ()
     ) -> None:
         self._url, self._config, self._growth = url, config, growth
         self._rows = dict(split.rows)
@@ -61,7 +61,7 @@ class HeldOut:
         """Whether any of these shards has held-out rows."""
         if self._growth is None or not shards:
             return False
-        read, rows = self._growth.held_out(self._url, shards)
+        read, rows = self._growth.validation_rows(self._url, shards)
         self.joined |= read
         self._rows |= rows
         return bool(rows)

@@ -42,7 +42,7 @@ def optical_axis_turn(angle_rad: float) -> Float[Array, "3 3"]:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def recut_affine(
+def crop_affine(
     stored: Window, stored_px: int, K: Float[Array, "3 3"], turn: Float[Array, "3 3"], window: Window, patch_px: int
 ) -> Float[Array, "2 3"]:
     """Affine map from the stored patch's pixels to the new patch's, both continuous (pixel centre at + 0.5).

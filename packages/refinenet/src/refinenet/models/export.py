@@ -71,7 +71,7 @@ def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
         parameter.requires_grad_(False)
     about = json.dumps(_about(loaded))
     config = loaded.provenance.config.network
-    example = random_pairs(2, config.patch_px, seed=0, depth=config.sees_depth)
+    example = random_pairs(2, config.patch_px, seed=0, depth=config.uses_depth)
     content = _onnx(network, example, about) if out.suffix == ".onnx" else _program(network, example, about)
     run = _onnx_runner(content) if out.suffix == ".onnx" else _program_runner(content)
     differences = _differences(network, run, config)
@@ -107,7 +107,7 @@ def random_pairs(b: int, patch_px: int, seed: int, *, depth: bool = False) -> tu
 def _differences(network: FlatNetwork, run: Callable[..., Outputs], config: NetworkConfig) -> dict[str, float]:
     worst: dict[str, float] = {}
     for b in CHECKED_BATCHES:
-        inputs = random_pairs(b, config.patch_px, seed=b, depth=config.sees_depth)
+        inputs = random_pairs(b, config.patch_px, seed=b, depth=config.uses_depth)
         with torch.no_grad():
             expected = network(*inputs)
         found = run(*inputs)

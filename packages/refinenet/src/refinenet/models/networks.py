@@ -254,7 +254,7 @@ class FlowNet(nn.Module):
     def forward(self, inputs: NetworkInput) -> PoseUpdate:
         """The update of each hypothesis."""
         depth_m, T = inputs.hypothesis_depth_m, inputs.T_cam_obj
-        assert depth_m is not None  # every stream fills it where the config says `sees_depth`
+        assert depth_m is not None  # every stream fills it where the config says `uses_depth`
         half_m = 0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
         seen, whole = self._seen(inputs, depth_m, half_m)
         with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit

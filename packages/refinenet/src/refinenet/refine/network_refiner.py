@@ -97,7 +97,7 @@ class Refiner:
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
-        self._sees_depth = loaded.provenance.config.network.sees_depth
+        self._sees_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
         self.viewer = Viewer(meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
@@ -128,7 +128,7 @@ class Refiner:
     @property
     def tells_closeness(self) -> bool:
         """Whether confidences come from an output that was trained to say how near a pose is to the truth."""
-        return self.scorer == "learned" and self.checkpoint.provenance.config.loss.confidence_target == "closeness"
+        return self.scorer == "learned" and self.checkpoint.provenance.config.loss.confidence_target == "pose_quality"
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -120,7 +120,7 @@ class _Clock:
         """Means since the last reading, for steps of so many pairs."""
         total_s = sum(self._spent_s.values())
         values = {f"{what}_ms": 1e3 * spent_s / self._steps for what, spent_s in self._spent_s.items()}
-        values["data_wait_share"] = self._spent_s["data_wait"] / total_s
+        values["data_wait_fraction"] = self._spent_s["data_wait"] / total_s
         values["pairs_per_s"] = self._steps * pairs / total_s
         self._steps, self._spent_s = 0, dict.fromkeys(self._spent_s, 0.0)
         return values

@@ -108,7 +108,7 @@ def flow_loss(update: PoseUpdate, target: LossTarget, objects: ObjectPoints) -> 
     return cost.sum(-1) / flow.on_object.sum(-1).clamp(min=1)
 
 
-def closeness(target: LossTarget, objects: ObjectPoints) -> Float[Tensor, " b"]:
+def pose_quality(target: LossTarget, objects: ObjectPoints) -> Float[Tensor, " b"]:
     """How near hypotheses are to the truth as the camera sees it, in [0, 1]: 1 there, 1 / e `CLOSE` away.
 
     What counts is the mean distance of projected model points, as a share of the object's box diagonal at the truth's
@@ -125,11 +125,11 @@ def closeness(target: LossTarget, objects: ObjectPoints) -> Float[Tensor, " b"]:
     return torch.exp(-torch.linalg.vector_norm(uv_px - true_px, dim=-1).mean(-1) / (CLOSE * size_px))
 
 
-def wanted_confidence(name: str, target: LossTarget, objects: ObjectPoints | None) -> Float[Tensor, " b"]:
-    """What a confidence is to say of hypotheses: their visible overlap, or their closeness."""
-    if name == "closeness":
+def confidence_targets(name: str, target: LossTarget, objects: ObjectPoints | None) -> Float[Tensor, " b"]:
+    """What a confidence is to say of hypotheses: their visible overlap, or their pose_quality."""
+    if name == "pose_quality":
         assert objects is not None
-        return closeness(target, objects)
+        return pose_quality(target, objects)
     assert target.visible_iou is not None
     return target.visible_iou
 
@@ -145,7 +145,7 @@ PIXEL_LOSSES = ("contour", "contour-forward", "point", "contour+point")
 LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 MOST_FLOW_COST = 50.0
 CLOSE = 0.06
-"""Share of the box diagonal at which closeness is 1 / e: a few pixels of a patch, within reach of the flow."""
+"""Share of the box diagonal at which pose_quality is 1 / e: a few pixels of a patch, within reach of the flow."""
 
 
 def make_loss(
@@ -155,8 +155,8 @@ def make_loss(
     point_weight: float,
     rotation_weight: float = 1.0,
     confidence_weight: float = 1.0,
-    confidence_target: str = "overlap",
-    min_closeness: float = 0.0,
+    confidence_target: str = "visible_iou",
+    min_pose_quality: float = 0.0,
     objects: ObjectPoints | None,
 ) -> Callable[[PoseUpdate, LossTarget], Float[Tensor, " b"]]:
     """The loss called `name`, one of `LOSSES`, as a function of an update and its target.
@@ -167,8 +167,8 @@ def make_loss(
         point_weight: weight of the point loss in `contour+point` and `flow+point`.
         rotation_weight: weight of the rotation within the point loss.
         confidence_weight: weight of the confidence's cross-entropy, added for updates that carry a confidence.
-        confidence_target: what it is compared with, see `wanted_confidence`.
-        min_closeness: hypotheses less close to the truth have no part in the loss but for their confidence.
+        confidence_target: what it is compared with, see `confidence_targets`.
+        min_pose_quality: hypotheses less close to the truth have no part in the loss but for their confidence.
         objects: model points and symmetries; only `mse`, and the contour losses of objects without symmetries, can do
             without.
     """
@@ -204,12 +204,12 @@ def make_loss(
 
     def loss(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
         value = pose(update, target)
-        if min_closeness > 0:
+        if min_pose_quality > 0:
             assert objects is not None
-            value = torch.where(closeness(target, objects) >= min_closeness, value, 0.0)
+            value = torch.where(pose_quality(target, objects) >= min_pose_quality, value, 0.0)
         if update.confidence is None:
             return value
-        wanted = wanted_confidence(confidence_target, target, objects)
+        wanted = confidence_targets(confidence_target, target, objects)
         return value + confidence_weight * confidence_loss(update, wanted)
 
     return loss

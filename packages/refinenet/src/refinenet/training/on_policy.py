@@ -22,7 +22,7 @@ from posecore.window import Window
 from torch import Tensor, nn
 
 from refinenet.batch import Batch, LossTarget, NetworkInput
-from refinenet.config import OwnPredictionsConfig, TrainConfig
+from refinenet.config import OnPolicyConfig, TrainConfig
 from refinenet.data.objects import for_patches
 from refinenet.data.online_pairs import MIN_CONTOUR_PX
 from refinenet.data.split import OWN
@@ -36,10 +36,10 @@ FARTHEST_SIDE = 2.0
 """A window of another scale than this factor is that of a network gone astray; the pair stays as it was."""
 
 
-def share_at(config: OwnPredictionsConfig, step: int, steps: int) -> float:
+def fraction_at(config: OnPolicyConfig, step: int, steps: int) -> float:
     """Part of a batch that starts from own predictions at a step of a run of `steps`."""
     done, span = step / steps - config.begin, config.full - config.begin
-    return config.share * (float(np.clip(done / span, 0, 1)) if span > 0 else float(done >= 0))
+    return config.fraction * (float(np.clip(done / span, 0, 1)) if span > 0 else float(done >= 0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +60,7 @@ class _Looks:
     scale: Float[Array, " s"]
 
 
-class OwnPredictions:
+class OnPolicyHypotheses:
     """Replaces part of a batch by pairs that start from the network's own predictions.
 
     What it does is a pure function of weights, batch, seed, rank, step and part of the step: a resumed run goes on as
@@ -80,7 +80,7 @@ class OwnPredictions:
         self._obj_ids = sorted(self._meshes)  # rows of `ObjectPoints`
         self._rasteriser: Rasteriser | None = None
 
-    def __enter__(self) -> "OwnPredictions":
+    def __enter__(self) -> "OnPolicyHypotheses":
         return self
 
     def __exit__(
@@ -106,8 +106,8 @@ class OwnPredictions:
         Raises:
             RenderError: There is no device to render on.
         """
-        own, b = self._config.own_predictions, len(batch.sample_ids)
-        share = share_at(own, step, self._config.steps)
+        own, b = self._config.on_policy, len(batch.sample_ids)
+        share = fraction_at(own, step, self._config.steps)
         if share == 0:
             return batch
         rng = np.random.default_rng([self._config.seed, OWN, step, part, self._rank])

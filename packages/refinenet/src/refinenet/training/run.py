@@ -20,19 +20,19 @@ from torch.nn.parallel import DistributedDataParallel
 
 from refinenet.batch import Batch, NetworkInput
 from refinenet.config import TrainConfig
-from refinenet.data.growing_split import Growth, wait_for_dataset, wait_for_start
+from refinenet.data.growing_split import GrowingSplit, wait_for_dataset, wait_for_start
 from refinenet.data.loader import make_loader, on_device
 from refinenet.data.objects import load_models, object_ids, object_points
 from refinenet.data.pair_stream import PairStream
-from refinenet.data.split import DataRecord, Split, divide, held_out_scenes, read_scenes
-from refinenet.data.validation_set import HeldOut
+from refinenet.data.split import DataRecord, Split, divide, read_scenes, validation_scenes
+from refinenet.data.validation_set import ValidationSet
 from refinenet.device import choose_device
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.models import checkpoint, inception
 from refinenet.models.networks import PaperNet, make_network
 from refinenet.training import validation
 from refinenet.training.losses import PIXEL_LOSSES, make_loss
-from refinenet.training.on_policy import OwnPredictions
+from refinenet.training.on_policy import OnPolicyHypotheses
 from refinenet.training.optimiser import FiniteGuard, RunningAverage, learning_rate, make_optimiser
 
 log = logging.getLogger(__name__)
@@ -100,18 +100,18 @@ class Trainer:
             # every rank for itself: one that waited for another's word would give up after some minutes
             wait_for_start(reader, config, self.world * max(1, config.loader.workers))
         state = None if last is None else checkpoint.load_state(out, last.provenance.step)
-        if state is not None and config.loader.follow and "held_out_shards" not in state:
+        if state is not None and config.loader.follow and "validation_shards" not in state:
             raise CheckpointError(
                 f"{out}: a run with --follow of an earlier version, which held out less; start a new run"
             )
         self.training, held_out, record = self._split(reader, resume=resume)
-        self._growth = Growth(out=out, record=record, config=config) if config.loader.follow else None
-        joined = [] if state is None else state.get("held_out_shards", [])
-        self._held_out = HeldOut(url, config, held_out, self._growth, joined) if self.rank == 0 else None
-        self._tell_skipped(*(self._held_out.skipped if self._held_out else ()))
+        self._growth = GrowingSplit(out=out, record=record, config=config) if config.loader.follow else None
+        joined = [] if state is None else state.get("validation_shards", [])
+        self._validation_set = ValidationSet(url, config, held_out, self._growth, joined) if self.rank == 0 else None
+        self._tell_skipped(*(self._validation_set.skipped if self._validation_set else ()))
         meshes = load_meshes(reader)
         points = object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg)
-        self._own_predictions = OwnPredictions(config, meshes, self.rank, reduced=self._reduced)
+        self._on_policy = OnPolicyHypotheses(config, meshes, self.rank, reduced=self._reduced)
         self.objects = points.to(self.device)
         self._dataset_sha256 = _dataset_sha256(reader, config)
         self._objects_card = {
@@ -124,7 +124,7 @@ class Trainer:
         self._loss = make_loss(
             config.loss.name, gamma=config.loss.gamma, point_weight=config.loss.point_weight,
             rotation_weight=config.loss.rotation_weight, confidence_weight=config.loss.confidence_weight,
-            confidence_target=config.loss.confidence_target, min_closeness=config.loss.min_closeness,
+            confidence_target=config.loss.confidence_target, min_pose_quality=config.loss.min_pose_quality,
             objects=self.objects,
         )  # fmt: skip
         pixels = config.loss.name in PIXEL_LOSSES and not config.network.confidence
@@ -156,7 +156,7 @@ class Trainer:
 
     def _share_buffers(self) -> None:
         """Rank 0's batch norm statistics on every rank, before own predictions: a resumed run begins with those."""
-        if self.world > 1 and self.config.own_predictions.share:
+        if self.world > 1 and self.config.on_policy.fraction:
             for buffer in self.network.buffers():
                 torch.distributed.broadcast(buffer, src=0)
 
@@ -187,16 +187,16 @@ class Trainer:
                     reader.url, len(reader.committed), n_shards(reader.card),
                 )  # fmt: skip
             if record is None:
-                held = held_out_scenes(
-                    reader.url, scene_of, validation.scene_share, self.config.seed, growing=settings.follow
+                held = validation_scenes(
+                    reader.url, scene_of, validation.scene_fraction, self.config.seed, growing=settings.follow
                 )
-                record = DataRecord(shards=tuple(scene_of), held_out=tuple(int(scene) for scene in held))
+                record = DataRecord(shards=tuple(scene_of), validation_scenes=tuple(int(scene) for scene in held))
                 record.save(self.out)
             shared = [(record, scene_of)]
         if self.world > 1:
             torch.distributed.broadcast_object_list(shared, src=0)
         record, scene_of = shared[0]
-        return (*divide(scene_of, record.held_out), record)
+        return (*divide(scene_of, record.validation_scenes), record)
 
     def _tell_skipped(self, *messages: str) -> None:
         for message in messages:
@@ -256,7 +256,7 @@ class Trainer:
         for i, batch in enumerate(batches):
             self._tell_skipped(*batch.skipped)
             self._share_buffers()
-            batch = self._own_predictions(self.network, batch.to(self.device), self.step, i)
+            batch = self._on_policy(self.network, batch.to(self.device), self.step, i)
             with self._apart() if i < len(batches) - 1 else nullcontext():
                 with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
                     update = self._predict(batch.inputs)
@@ -276,7 +276,7 @@ class Trainer:
         self.step += 1
         loss = torch.stack([values.detach().mean() for values in losses]).mean()
         shares = [batch.visible_fraction for batch in batches if batch.visible_fraction is not None]
-        told = {"visible_share": torch.stack([share.mean() for share in shares]).mean()} if shares else {}
+        told = {"visible_fraction": torch.stack([share.mean() for share in shares]).mean()} if shares else {}
         return {self.loss_key: loss, "learning_rate": rate, "gradient_norm": norm, **told}
 
     def _predict(self, pair: NetworkInput) -> PoseUpdate:
@@ -310,7 +310,7 @@ class Trainer:
             TrainingError: As `take_step`.
         """
         self.settle()
-        for key in (self.loss_key, "visible_share"):
+        for key in (self.loss_key, "visible_fraction"):
             value = values.get(key)
             if self.world > 1 and value is not None:
                 mean = torch.as_tensor(value, device=self.device) / self.world
@@ -323,13 +323,18 @@ class Trainer:
 
         Where more pairs have joined, errors do not compare with those before, and the best so far is forgotten.
         """
-        assert self._held_out is not None
-        if self._held_out.grow():
-            self._tell_skipped(*self._held_out.skipped)
+        assert self._validation_set is not None
+        if self._validation_set.grow():
+            self._tell_skipped(*self._validation_set.skipped)
             self.best_mm = math.inf
         loss = self.config.loss
         return validation.measure(
-            self.kept, self._held_out.batches, self.objects, self.device, loss.confidence_target, loss.min_closeness
+            self.kept,
+            self._validation_set.batches,
+            self.objects,
+            self.device,
+            loss.confidence_target,
+            loss.min_pose_quality,
         )
 
     def save(self, errors: dict[str, float] | None) -> None:
@@ -350,10 +355,10 @@ class Trainer:
         if errors is not None and errors["validation/add_after_mm"] < self.best_mm:
             checkpoint.save(self.out / "best.safetensors", self.kept, provenance)
             self.best_mm = errors["validation/add_after_mm"]
-        assert self._held_out is not None
+        assert self._validation_set is not None
         state = {
             "optimiser": self._optimiser.state_dict(), "best_mm": self.best_mm, "world": self.world,
-            "held_out_shards": sorted(self._held_out.joined),
+            "validation_shards": sorted(self._validation_set.joined),
         }  # fmt: skip
         if self._average is not None:
             state["weights"] = self.network.state_dict()
@@ -367,7 +372,7 @@ class Trainer:
         The reducer goes first: were it the last owner of the group, its destructor would wait, with Python's lock
         held, for a thread that needs that lock.
         """
-        self._own_predictions.close()
+        self._on_policy.close()
         self._parallel = self._forward = self.network
         gc.collect()
 

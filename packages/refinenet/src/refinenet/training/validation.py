@@ -16,7 +16,8 @@ from torch.utils.tensorboard import SummaryWriter
 from refinenet.batch import Batch
 from refinenet.geometry import poses
 from refinenet.geometry.symmetry import ObjectPoints, nearest_by_angle, nearest_by_points
-from refinenet.training.losses import closeness, wanted_confidence
+from refinenet.models.migration import migrated_metrics
+from refinenet.training.losses import confidence_targets, pose_quality
 
 
 def pose_errors(
@@ -48,8 +49,8 @@ def measure(
     batches: Iterable[Batch],
     objects: ObjectPoints,
     device: torch.device,
-    confidence_target: str = "overlap",
-    min_closeness: float = 0.0,
+    confidence_target: str = "visible_iou",
+    min_pose_quality: float = 0.0,
 ) -> dict[str, float]:
     """Errors before and after one update: mean of each, and the rotation's median.
 
@@ -67,10 +68,10 @@ def measure(
     off: list[Tensor] = []
     for batch in batches:
         batch = batch.to(device)
-        counted.append(closeness(batch.target, objects).cpu() >= min_closeness)
+        counted.append(pose_quality(batch.target, objects).cpu() >= min_pose_quality)
         start, update = batch.inputs.T_cam_obj, network(batch.inputs)
         if update.confidence is not None:
-            wanted = wanted_confidence(confidence_target, batch.target, objects)
+            wanted = confidence_targets(confidence_target, batch.target, objects)
             off.append((torch.sigmoid(update.confidence) - wanted).abs().cpu())
         for when, pose in (("before", start), ("after", poses.apply_update(start, update))):
             errors = pose_errors(pose, batch.target.T_cam_obj, batch.target.object_index, objects)
@@ -124,7 +125,7 @@ class MetricLog:
                 break
             if not isinstance(line, dict) or not isinstance(line.get("step"), int):
                 break
-            lines.append(line)
+            lines.append(migrated_metrics(line))
         return lines
 
     def write(self, step: int, values: Mapping[str, float]) -> None:

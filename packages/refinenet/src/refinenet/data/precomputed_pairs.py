@@ -12,13 +12,13 @@ from refinenet.data.online_pairs import PairArrays
 from refinenet.image import augmentation
 from refinenet.image.masks import visible_overlap
 
-STORED_FIELDS = (
+PRECOMPUTED_FIELDS = (
     "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
     "hypothesis_contour_cam_m", "scene_distance_px", "hypothesis_distance_px", "scene_mask", "obj_id",
 )  # fmt: skip
 
 
-def stored_pairs(
+def precomputed_pairs(
     samples: Sequence[Mapping[str, Any]],
     rngs: Sequence[np.random.Generator],
     config: TrainConfig,
@@ -48,7 +48,7 @@ def stored_pairs(
     for i, (sample, rng) in enumerate(zip(samples, rngs, strict=True)):
         if rng.random() < augment_config.background:
             other = samples[int(rng.integers(len(samples)))]
-            behind = augmentation.backdrop(
+            behind = augmentation.background_patch(
                 other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng
             )
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
