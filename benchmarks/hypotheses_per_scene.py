@@ -52,7 +52,7 @@ def measure(config: TrainConfig, run: Path, test: Path) -> dict[str, float]:
     )
     network = checkpoint.load(run / "last.safetensors").network()
     device = choose_device("cpu")
-    errors = validation.measure(network, validation_batches(source, split, config.batch), objects, device)
+    errors = validation.measure(network, validation_batches(source, split, config.batch), objects, device, config.loss)
     source.close()
     return {name.removeprefix("validation/"): round(value, 3) for name, value in errors.items()}
 

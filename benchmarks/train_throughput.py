@@ -23,6 +23,7 @@ import torch
 from refinenet.batch import Batch
 from refinenet.config import PresetName, load_config
 from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 from torch.utils.flop_counter import FlopCounterMode
 
 PEAK_TFLOPS = {"H100": 989.0, "H200": 989.0, "A100": 312.0}
@@ -45,7 +46,7 @@ def main() -> None:
     total = (2 * arguments.rounds + 2) * arguments.steps
     config = load_config(arguments.preset, [*arguments.overrides, f"steps={total}", "validation.pairs=16"])
     with tempfile.TemporaryDirectory() as folder:
-        run = Trainer(config, arguments.shards, Path(folder))
+        run = open_run(config, arguments.shards, Path(folder))
         batches = run.stream()
         kept = next(batches).to(run.device)
         step_flops = flops(run, kept)

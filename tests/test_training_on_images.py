@@ -60,5 +60,5 @@ def test_windows_that_follow_the_distance_are_not_for_a_fixed_one(work: Path) ->
         arguments = ["train", str(work / shards), "--preset", "paper", *settings, "--out", str(work / "no")]
         result = CliRunner().invoke(refinenet, arguments)
         assert result.exit_code == 2, result.output
-        assert "windows are not of one side for all poses of an object" in result.stderr
+        assert "windows differ in side between poses of an object" in result.stderr
         assert "--set window=fixed" in result.stderr

@@ -11,10 +11,17 @@ from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
 from refinenet.data.growing_split import GrowingSplit, wait_for_start
-from refinenet.data.split import OTHER_OBJECT, DataRecord, divide, drawn_out, read_scenes, validation_scenes
+from refinenet.data.split import (
+    OTHER_OBJECT,
+    DataRecord,
+    choose_validation_scenes,
+    divide,
+    draw_validation_scenes,
+    read_scenes,
+)
 from refinenet.models.checkpoint import load
 from refinenet.training.loop import train
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 
 from ..training.test_training import small
 
@@ -42,7 +49,7 @@ def test_only_the_chosen_objects_scenes_are_split(two_objects):
     scene_of, _ = read_scenes(reader, reader.committed, objects=(2,))
     flat = np.concatenate(list(scene_of.values()))
     assert set(flat) == {OTHER_OBJECT, *range(1, 24, 2)}
-    scenes = validation_scenes(reader.url, scene_of, 0.25, 0)
+    scenes = choose_validation_scenes(reader.url, scene_of, 0.25, 0)
     assert len(scenes) == 3 and (scenes % 2 == 1).all()
     training, validation = divide(scene_of, scenes)
     assert (training.scenes, validation.scenes) == (9, 3)
@@ -51,10 +58,10 @@ def test_only_the_chosen_objects_scenes_are_split(two_objects):
 
 def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     config = small("objects=[2]", "batch=4", "steps=3", "loader.workers=0")
-    run = Trainer(config, str(two_objects), tmp_path / "look")
+    run = open_run(config, str(two_objects), tmp_path / "look")
     for batch in itertools.islice(run.stream(), 12):
         assert (batch.target.object_index == 1).all()
-    assert all((batch.target.object_index == 1).all() for batch in run._validation_set.batches)
+    assert all((batch.target.object_index == 1).all() for batch in run.data.validation.batches)
     run.close()
     train(config, str(two_objects), tmp_path / "run")
     assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
@@ -82,7 +89,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
     copy = shutil.copytree(two_objects, tmp_path / "growing")
     lines = (copy / "manifest.jsonl").read_text().splitlines(keepends=True)
     (copy / "manifest.jsonl").write_text("".join(lines[:2]))
-    assert drawn_out(np.arange(8), 0.1, 2).tolist() == [6]
+    assert draw_validation_scenes(np.arange(8), 0.1, 2).tolist() == [6]
     reader = ShardReader(str(copy))
 
     class Waited(Exception):
@@ -100,7 +107,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
 
 def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):
     with pytest.raises(ConfigError, match="there is no object 7 in it, only 1, 2"):
-        Trainer(small("objects=[1, 7]"), str(two_objects), tmp_path / "run")
+        open_run(small("objects=[1, 7]"), str(two_objects), tmp_path / "run")
     result = cli("train", two_objects, "--object", 7, "--out", tmp_path / "run", "--quiet")
     assert result.exit_code == 2
     assert "there is no object 7" in result.stderr

@@ -6,9 +6,9 @@ from posecore.raster import Rasteriser
 from posecore.shard import ShardReader
 from posecore.window import Window, cut
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig, load_config
-from refinenet.data.online_pairs import PairMaker, draw_hypothesis
+from refinenet.data.online_pairs import OnlinePairMaker, draw_hypothesis
 from refinenet.image import augmentation
-from refinenet.image.crops import crop_affine, optical_axis_turn, warp
+from refinenet.image.crops import crop_affine, optical_axis_rotation, warp
 from refinenet.image.masks import visible_overlap, visible_share
 
 
@@ -25,7 +25,7 @@ def rasteriser(mesh):
 
 
 def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, symmetries=None, **hypothesis):
-    maker = PairMaker(
+    maker = OnlinePairMaker(
         meshes={1: mesh},
         rasteriser=rasteriser,
         patch_px=64,
@@ -194,7 +194,7 @@ def test_occluders_hide_part_of_the_object_and_nothing_else(mesh, rasteriser, sa
 
 
 def test_fixed_windows_keep_their_side_in_the_image(mesh, rasteriser, samples):
-    maker = PairMaker(
+    maker = OnlinePairMaker(
         meshes={1: mesh}, rasteriser=rasteriser, patch_px=64, window=WindowConfig(kind="fixed"), contour_points=32,
         hypothesis=HypothesisConfig(online=True), augment_config=AugmentConfig(), fixed_sides_px={1: 188.0},
     )  # fmt: skip
@@ -235,8 +235,8 @@ def test_colour_augmentation_keeps_black_and_moves_both_patches_together():
     np.testing.assert_array_equal(same[0], hypothesis)
 
 
-def test_the_optical_axis_turn_keeps_depth():
-    R = optical_axis_turn(0.7)
+def test_the_optical_axis_rotation_keeps_depth():
+    R = optical_axis_rotation(0.7)
     assert se3.is_rotation(R)
     np.testing.assert_array_equal(R[2], [0, 0, 1])
 

@@ -11,7 +11,7 @@ from posecore.shard import ShardReader
 from refinenet.config import load_config
 from refinenet.data.loader import make_loader
 from refinenet.data.pair_stream import PairSource, PairStream
-from refinenet.data.split import divide, read_scenes, spread_rows, validation_scenes
+from refinenet.data.split import choose_validation_scenes, divide, read_scenes, spread_rows
 from refinenet.data.validation_set import validation_batches
 from refinenet.geometry import poses
 
@@ -27,7 +27,7 @@ SMALL = [
 def split_by_scene(reader, share, seed):
     """A dataset's samples for training and for validation."""
     scene_of, _ = read_scenes(reader, reader.committed)
-    return divide(scene_of, validation_scenes(reader.url, scene_of, share, seed))
+    return divide(scene_of, choose_validation_scenes(reader.url, scene_of, share, seed))
 
 
 @pytest.fixture(scope="module")

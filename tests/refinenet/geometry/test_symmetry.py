@@ -7,6 +7,7 @@ from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.symmetry import ContinuousSymmetry
 from refinenet.batch import LossTarget
+from refinenet.config import LossConfig
 from refinenet.data.objects import object_points
 from refinenet.geometry import poses, symmetry
 from refinenet.training import losses, validation
@@ -120,7 +121,7 @@ def test_the_contour_loss_does_not_mind_which_twin_is_the_truth(mesh, name):
     target = target._replace(
         scene_contour_m=contour_m, hypothesis_contour_m=contour_m, scene_distance_px=ramp, hypothesis_distance_px=ramp
     )
-    cost = losses.make_loss(name, gamma=1.0, point_weight=0.1, objects=objects_with(mesh, info))
+    cost = losses.make_loss(LossConfig(name=name, gamma=1.0, point_weight=0.1), objects_with(mesh, info))
     update = poses.update_between(target.T_cam_obj_hypothesis, torch.from_numpy(random_poses(rng)))
     other = target._replace(T_cam_obj=torch.from_numpy(T_true @ S))
     torch.testing.assert_close(cost(update, target), cost(update, other), atol=1e-4, rtol=1e-4)

@@ -10,7 +10,7 @@ from posecore.errors import ConfigError
 from posecore.raster import Rasteriser
 from posecore.window import diameter_window
 from refinenet.batch import LossTarget
-from refinenet.config import load_config
+from refinenet.config import LossConfig, load_config
 from refinenet.data.pair_stream import PairSource
 from refinenet.geometry import poses
 from refinenet.geometry.poses import Flow
@@ -22,7 +22,7 @@ from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Status
 from refinenet.training import losses, validation
 from refinenet.training.on_policy import OnPolicyHypotheses
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
@@ -211,7 +211,7 @@ def test_the_flow_loss_has_true_gradients_also_behind_the_camera(scenes, mesh):
     behind[:, 2, 3] -= 2.0
     value = cost(*leaves, at=target._replace(T_cam_obj=behind))
     assert torch.isfinite(value).all()
-    assert value.max() <= losses.MOST_FLOW_COST
+    assert value.max() <= losses.MAX_FLOW_COST
     assert all(torch.isfinite(g).all() for g in torch.autograd.grad(value.sum(), leaves))
 
 
@@ -248,9 +248,9 @@ def test_pose_quality_is_one_at_the_ground_truth_and_falls_with_the_visible_erro
         return losses.pose_quality(hypotheses_at(scenes, (turn, move)), points)
 
     torch.testing.assert_close(at(still, still), torch.ones(4, dtype=torch.float64))
-    across = at(still, [losses.CLOSE * size_m, 0.0, 0.0])
+    across = at(still, [losses.POSE_QUALITY_SCALE * size_m, 0.0, 0.0])
     np.testing.assert_allclose(across, np.exp(-1), rtol=0.05)  # nearer points move by more pixels
-    in_depth = at(still, [0.0, 0.0, losses.CLOSE * size_m])
+    in_depth = at(still, [0.0, 0.0, losses.POSE_QUALITY_SCALE * size_m])
     assert (in_depth > 0.7).all()
     turned = [at(np.deg2rad(angle) * np.array([0.0, 0.0, 1.0]), still) for angle in (5, 20, 60)]
     assert (turned[0] > turned[1] + 0.1).all() and (turned[1] > 2 * turned[2]).all()
@@ -273,7 +273,7 @@ def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
     update = solved(true_flow(*scenes), scenes[1], scenes[2], mesh)
     for name, wanted in (("visible_iou", target.visible_iou), ("pose_quality", close)):
         cost = losses.make_loss(
-            "flow+point", gamma=1.0, point_weight=0.0, confidence_target=name, objects=points_of(mesh)
+            LossConfig(name="flow+point", point_weight=0.0, confidence_target=name), points_of(mesh)
         )
         at = wanted.clamp(1e-6, 1 - 1e-6).logit().requires_grad_()
         (slope,) = torch.autograd.grad(cost(update._replace(confidence=at), target).sum(), at)
@@ -326,7 +326,7 @@ def test_stored_pairs_have_their_depth_too(dataset):
 @pytest.mark.slow
 def test_it_learns_where_points_went(dataset, tmp_path):
     """A few steps on one batch: offsets come closer than those that nothing was learnt of, and the pose with them."""
-    trainer = Trainer(flow_config("optimiser.lr=0.003", "steps=150"), str(dataset), tmp_path)
+    trainer = open_run(flow_config("optimiser.lr=0.003", "steps=150"), str(dataset), tmp_path)
     batch = batch_of(dataset, trainer.config)
     network = trainer.network
 
@@ -372,7 +372,7 @@ def points_of_dataset(dataset):
 def run(dataset, tmp_path_factory):
     """A checkpoint of a network whose offsets are not zero."""
     out = tmp_path_factory.mktemp("flow")
-    trainer = Trainer(flow_config("network.confidence=true", "network.match_radius=1"), str(dataset), out)
+    trainer = open_run(flow_config("network.confidence=true", "network.match_radius=1"), str(dataset), out)
     with torch.no_grad():
         trainer.network.head.bias.copy_(torch.tensor([0.3, -0.2, 0.0, 0.0, 0.1]))
     trainer.save(None)
@@ -401,7 +401,7 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
 def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target, output):
     says = [f"loss.confidence_target={target}"] if output else []
     config = flow_config(f"network.confidence={str(output).lower()}", "network.match_radius=1", *says)
-    trainer = Trainer(config, str(dataset), tmp_path)
+    trainer = open_run(config, str(dataset), tmp_path)
     trainer.save(None)
     trainer.close()
     with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
@@ -421,9 +421,9 @@ def test_validation_measures_the_confidence_against_what_it_is_to_say(dataset):
     batch, points = batch_of(dataset, flow_config("network.confidence=true")), points_of_dataset(dataset)
     errors = {}
     for target in ("visible_iou", "pose_quality"):
-        found = validation.measure(Unsure(), [batch], points, torch.device("cpu"), target)
+        found = validation.measure(Unsure(), [batch], points, torch.device("cpu"), LossConfig(confidence_target=target))
         errors[target] = found["validation/confidence_error"]
-        wanted = losses.confidence_targets(target, batch.target, points)
+        wanted = losses.confidence_target(target, batch.target, points)
         assert errors[target] == pytest.approx(float((wanted - 0.5).abs().mean()), rel=1e-5)
     assert abs(errors["visible_iou"] - errors["pose_quality"]) > 0.01
 
@@ -437,7 +437,8 @@ def test_what_the_loss_leaves_out_is_not_measured(dataset):
     before = validation.pose_errors(batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
 
     def measured(least):
-        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), "pose_quality", least)
+        loss = LossConfig(confidence_target="pose_quality", min_pose_quality=least)
+        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), loss)
 
     some, every, none = measured(0.2), measured(0.0), measured(0.999)
     assert some["validation/pairs"] == counted.sum()

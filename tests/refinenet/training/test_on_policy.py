@@ -13,7 +13,7 @@ from refinenet.models import checkpoint
 from refinenet.training import losses
 from refinenet.training.loop import train
 from refinenet.training.on_policy import OnPolicyHypotheses, fraction_at
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 from safetensors.torch import load_file
 from torch import nn
 
@@ -176,7 +176,7 @@ def test_every_switch_trains_alone(dataset, tmp_path, switch):
     switches = stored if switch == "stored pairs" else [switch]
     if any("on_policy" in each for each in switches):
         switches += ["on_policy.begin=0", "on_policy.full=0"]
-    trainer = Trainer(small(*switches), str(dataset), tmp_path)
+    trainer = open_run(small(*switches), str(dataset), tmp_path)
     try:
         values = trainer.take_step(next(trainer.stream()))
     finally:

@@ -4,6 +4,7 @@ from refinenet.config.data import AugmentConfig, HypothesisConfig, LoaderConfig,
 from refinenet.config.load import load_config
 from refinenet.config.network import BackboneConfig, NetworkConfig
 from refinenet.config.train import (
+    ConfidenceTarget,
     DeviceName,
     LossConfig,
     LossName,
@@ -16,6 +17,7 @@ from refinenet.config.train import (
 __all__ = [
     "AugmentConfig",
     "BackboneConfig",
+    "ConfidenceTarget",
     "DeviceName",
     "HypothesisConfig",
     "LoaderConfig",

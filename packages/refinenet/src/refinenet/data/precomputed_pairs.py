@@ -1,4 +1,4 @@
-"""Pairs exactly as shards hold them, for networks that look through the shard's own fixed window."""
+"""Precomputed pairs, as shards hold them, for networks with the shards' fixed window."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -23,23 +23,25 @@ def precomputed_pairs(
     rngs: Sequence[np.random.Generator],
     config: TrainConfig,
     augment_config: AugmentConfig,
-    where: str,
+    url: str,
 ) -> PairArrays:
-    """Stack samples into a batch; contour points are thinned evenly to the configured number.
+    """Stack samples into a batch; contour points are subsampled evenly to the configured number.
 
     Raises:
         ConfigError: The shards' patches are not of the network's size, or hold fewer contour points than asked for.
     """
-    stored_px, wanted_px = len(samples[0]["scene_rgb"]), config.network.patch_px
-    if stored_px != wanted_px:
+    shard_px, patch_px = len(samples[0]["scene_rgb"]), config.network.patch_px
+    if shard_px != patch_px:
         raise ConfigError(
-            f"{where}: patches of {stored_px} px, preset {config.preset} expects {wanted_px}; "
-            f"render with --set patch_px={wanted_px}"
+            f"{url}: patches of {shard_px} px, preset {config.preset} expects {patch_px}; "
+            f"render with --set patch_px={patch_px}"
         )
-    stored, n = len(samples[0]["scene_contour_cam_m"]), config.loss.contour_points
-    if n > stored:
-        raise ConfigError(f"{where}: {stored} contour points, loss.contour_points is {n}; set it to {stored} or less")
-    thin = (np.arange(n) * stored) // n
+    available, n = len(samples[0]["scene_contour_cam_m"]), config.loss.contour_points
+    if n > available:
+        raise ConfigError(
+            f"{url}: {available} contour points, loss.contour_points is {n}; set it to {available} or less"
+        )
+    thin = (np.arange(n) * available) // n
 
     def stack(name: str) -> np.ndarray:
         return np.stack([sample[name] for sample in samples])
@@ -49,7 +51,7 @@ def precomputed_pairs(
         if rng.random() < augment_config.background:
             other = samples[int(rng.integers(len(samples)))]
             behind = augmentation.background_patch(
-                other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng
+                other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, shard_px, rng
             )
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
     depth_m = stack("hypothesis_depth_m") if "hypothesis_depth_m" in samples[0] else None
