@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from bop_folders import CAMERA, name_sensor, write_rendered
-from posecore.bop import BopDataset, Target
+from posecore.bop import BopDataset, BopTarget
 from posecore.errors import DatasetError
 from posecore.mesh import load_mesh
 
@@ -48,12 +48,12 @@ def test_a_single_named_sensor_needs_no_choice(root):
     dataset = BopDataset(root)
     assert dataset.sensors == ("photoneo",)
     assert dataset.scene_ids == [3, 11]
-    assert dataset.image_path(3, 4) == root / "test/000003/rgb_photoneo/000004.png"
+    assert dataset.image_file(3, 4).path == root / "test/000003/rgb_photoneo/000004.png"
     assert dataset.depth_m(3, 4).max() > 0.4
     assert dataset.mask(3, 4, 1, visible=True).sum() > 50
     assert dataset.gt(3, 4)[0].visib_fract == pytest.approx(1.0)
     assert dataset.camera_file == root / "camera_photoneo.json"
-    assert dataset.targets[0] == Target(scene_id=3, im_id=0, obj_id=1)
+    assert dataset.targets[0] == BopTarget(scene_id=3, im_id=0, obj_id=1)
 
 
 def test_several_sensors_are_listed_until_one_is_named(root):
@@ -94,8 +94,8 @@ def test_scenes_of_different_sensors_take_the_first_they_have(root):
         BopDataset(root)
     dataset = BopDataset(root, sensor="rgb,gray1")
     assert dataset.scene_ids == [3, 11]
-    assert dataset.image_path(3, 0).parent.name == "rgb"
-    assert dataset.image_path(11, 7).parent.name == "gray1"
+    assert dataset.image_file(3, 0).path.parent.name == "rgb"
+    assert dataset.image_file(11, 7).path.parent.name == "gray1"
     assert dataset.rgb(11, 7).shape == (CAMERA.height_px, CAMERA.width_px, 3)
     assert len(dataset.gt(11, 7)) == 2
 

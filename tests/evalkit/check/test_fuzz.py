@@ -510,6 +510,6 @@ def test_report_survives_anything_in_json(root, sound, tmp_path, name, which, ne
 def test_report_survives_any_result_file_and_sidecar(root, sound, tmp_path, change, sidecar):
     file = tmp_path / "poses_cubes-test.csv"
     file.write_bytes(change((sound.parent / "poses_cubes-test.csv").read_bytes()))
-    content = {"dataset": str(root), "method": "x", "perturbation": sidecar, "start_lines": sidecar}
+    content = {"dataset": str(root), "method": "x", "perturbation": sidecar, "initial_lines": sidecar}
     Path(f"{file}.json").write_text(json.dumps(content))
     reported(root, file, tmp_path / "report")

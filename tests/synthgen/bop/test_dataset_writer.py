@@ -15,6 +15,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from synthgen.bop import dataset_writer
 from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import load_config
@@ -212,7 +213,7 @@ def test_training_images_are_jpeg_share_their_scene_and_have_no_targets(tmp_path
     dataset = BopDataset(tmp_path / "p", "train_pbr")
     assert [(s, dataset.im_ids(s)) for s in dataset.scene_ids] == [(0, [0, 1]), (1, [0])]
     assert not list((tmp_path / "p").glob("*targets*"))
-    assert dataset.image_path(0, 0).suffix == ".jpg"
+    assert dataset.image_file(0, 0).path.suffix == ".jpg"
     cameras = json.loads((tmp_path / "p/train_pbr/000000/scene_camera.json").read_text())
     in_world = []
     for im_id in (0, 1):
@@ -290,7 +291,7 @@ def test_depth_steps_grow_for_far_scenes(config_of, meshes):
 
     for overrides, scale in (((), 0.1), (("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0)):
         config = config_of(*overrides)
-        assert write_dataset._depth_scale(config, make_targets(meshes, config)) == scale
+        assert dataset_writer._depth_scale(config, make_targets(meshes, config)) == scale
 
 
 @pytest.mark.blender

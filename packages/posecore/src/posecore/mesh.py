@@ -24,7 +24,6 @@ from posecore.ply import refuse_broken_ply
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
 
-Array = np.ndarray
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 DIAMETER_RANGE_M = (2e-3, 10.0)
@@ -45,12 +44,12 @@ class Mesh:
         sha256: Hash of that file's bytes.
     """
 
-    vertices_m: Float[Array, "v 3"]
-    faces: Int[Array, "f 3"]
-    normals: Float[Array, "v 3"]
-    vertex_rgb: UInt8[Array, "v 3"] | None = None
-    uv: Float[Array, "v 2"] | None = None
-    texture_rgb: UInt8[Array, "h w 3"] | None = None
+    vertices_m: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    vertex_rgb: UInt8[np.ndarray, "v 3"] | None = None
+    uv: Float[np.ndarray, "v 2"] | None = None
+    texture_rgb: UInt8[np.ndarray, "h w 3"] | None = None
     path: str = ""
     sha256: str = ""
 
@@ -60,12 +59,16 @@ class Mesh:
         return diameter(self.vertices_m)
 
     @cached_property
-    def center_m(self) -> Float[Array, "3"]:
+    def center_m(self) -> Float[np.ndarray, "3"]:
         """Centre of the axis-aligned bounding box in object coordinates, metres."""
         return np.asarray((self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2)
 
+    def center_cam_m(self, T_cam_obj: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3"]:
+        """Centre of the bounding box in camera coordinates at each pose, metres."""
+        return np.asarray(T_cam_obj[..., :3, :3] @ self.center_m + T_cam_obj[..., :3, 3])
+
     @cached_property
-    def colours(self) -> UInt8[Array, "v 3"]:
+    def colours(self) -> UInt8[np.ndarray, "v 3"]:
         """Vertex colours; sampled from the texture where there is one, mid grey where there is nothing."""
         if self.vertex_rgb is not None:
             return self.vertex_rgb
@@ -98,7 +101,7 @@ class Mesh:
         return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
 
 
-def diameter(points_m: Float[Array, "v 3"]) -> float:
+def diameter(points_m: Float[np.ndarray, "v 3"]) -> float:
     """Largest distance between two points, over their convex hull."""
     points = np.asarray(points_m, np.float64)
     try:
@@ -177,7 +180,7 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
     return mesh
 
 
-def _unit(normals: Float[Array, "v 3"]) -> Float[Array, "v 3"]:
+def _unit(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Normals of length 1, as files need not hold them (MeshLab writes sums of angles); zero stays zero."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
@@ -219,7 +222,7 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
 
 def _appearance(
     file: Path, geometry: trimesh.Trimesh, allow_missing_textures: bool
-) -> tuple[UInt8[Array, "v 3"] | None, Float[Array, "v 2"] | None, UInt8[Array, "h w 3"] | None]:
+) -> tuple[UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, "v 2"] | None, UInt8[np.ndarray, "h w 3"] | None]:
     visual: Any = geometry.visual
     material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)

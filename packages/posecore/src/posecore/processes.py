@@ -1,4 +1,4 @@
-"""What processes that others start have in common: they end with their parent and leave ctrl-C to it."""
+"""Child processes: they exit with their parent and leave Ctrl-C to it; pools for tasks."""
 
 import ctypes
 import multiprocessing
@@ -8,9 +8,10 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 from posecore.errors import RenderError
@@ -98,3 +99,84 @@ def in_order(pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Itera
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()
+
+
+def unordered(
+    pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Iterable[T], ahead: int
+) -> Iterator[tuple[T, R]]:
+    """Tasks with their results, as they finish; at most `ahead` are submitted at once."""
+    numbered = ((number, task) for number, task in enumerate(tasks))
+    submitted: dict[int, T] = {}
+    for number, result in _finished(pool, function, numbered, submitted, ahead):
+        yield submitted.pop(number), result
+
+
+def map_unordered(
+    job: Callable[[T], R],
+    items: Iterable[T],
+    workers: int,
+    *,
+    start: Callable[..., None] = behave_as_worker,
+    arguments: tuple[Any, ...] = (),
+    died: Callable[[T], str],
+    ahead: int = 2,
+    attempts: int = 1,
+    on_crash: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[T, R]]:
+    """Items with their results from new processes, as they finish; processes that die are replaced.
+
+    Once the results are exhausted, the processes end; at an error, or if the iterator is closed, they end at once.
+
+    Args:
+        job: A function of a module, called with an item in a process.
+        items: Taken from the iterable as processes become free; any picklable values.
+        workers: Number of processes.
+        start: Called first in each process; it begins with `behave_as_worker`.
+        arguments: Its arguments.
+        died: The message, from the first item without a result, when too many processes die.
+        ahead: Items submitted at once for each process.
+        attempts: Crashes in a row, without a result in between, that end the run; each lesser number is retried.
+        on_crash: Called after a crash with no process running, for example to delete partial files.
+
+    Raises:
+        RenderError: Processes died `attempts` times in a row.
+    """
+    numbered = enumerate(items)
+    submitted: dict[int, T] = {}
+    crashes = 0
+    while True:
+        crash: BrokenProcessPool | None = None
+        with spawned(workers, start, arguments, "a worker process died") as pool:
+            again = tuple(sorted(submitted.items()))
+            try:
+                for number, result in _finished(pool, job, chain(again, numbered), submitted, ahead * workers):
+                    crashes = 0
+                    yield submitted.pop(number), result
+            except BrokenProcessPool as error:
+                crash = error
+        if crash is None:
+            return
+        crashes += 1
+        on_crash()
+        if crashes == attempts:
+            raise RenderError(died(submitted[min(submitted)])) from crash
+
+
+def _finished(
+    pool: ProcessPoolExecutor,
+    function: Callable[[T], R],
+    numbered: Iterable[tuple[int, T]],
+    submitted: dict[int, T],
+    ahead: int,
+) -> Iterator[tuple[int, R]]:
+    """Numbers of finished tasks with results; `submitted` also gets each task before it runs."""
+    waiting = iter(numbered)
+    running: dict[Future[R], int] = {}
+    while True:
+        for number, task in islice(waiting, ahead - len(running)):
+            submitted[number] = task
+            running[pool.submit(function, task)] = number
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), future.result()

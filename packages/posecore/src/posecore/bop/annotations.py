@@ -11,7 +11,6 @@ from posecore.bop.jsonfile import fraction, integer, numbers, shown
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 NO_POSE_MM = -1.0
 LARGEST_T_MM = 1e9
 LARGEST_DEPTH_SCALE = 1e6
@@ -31,14 +30,14 @@ class GroundTruth:
     """
 
     obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     visib_fract: float | None = None
     gt_index: int = 0
     has_pose: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
-class Target:
+class BopTarget:
     """An object to be found in an image, `inst_count` times."""
 
     scene_id: int
@@ -47,7 +46,7 @@ class Target:
     inst_count: int = 1
 
 
-def camera_matrix(entry: Any, where: str) -> Float[Array, "3 3"]:
+def camera_matrix(entry: Any, where: str) -> Float[np.ndarray, "3 3"]:
     """The camera matrix of an entry of `scene_camera.json`: `cam_K`, or a `cam_model` that is a pinhole.
 
     Raises:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from posecore.bop.annotations import GroundTruth, Target, camera_matrix, depth_scale, ground_truth, visib_fract
+from posecore.bop.annotations import BopTarget, GroundTruth, camera_matrix, depth_scale, ground_truth, visib_fract
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import image_size, read_depth, read_rgb
 from posecore.bop.jsonfile import integer, read_json
@@ -20,9 +20,7 @@ from posecore.camera import Camera
 from posecore.errors import CameraError, DatasetError
 from posecore.mesh import Mesh, load_mesh
 
-__all__ = ["BopDataset", "GroundTruth", "Target"]
-
-Array = np.ndarray
+__all__ = ["BopDataset", "BopTarget", "GroundTruth"]
 
 
 class BopDataset:
@@ -96,9 +94,9 @@ class BopDataset:
         self._require(scene_id)
         return self._source.annotation(scene_id, kind)
 
-    def annotated_by(self, scene_id: int, of: Kind = "gt") -> str:
+    def annotated_by(self, scene_id: int, kind: Kind = "gt") -> str:
         """What decides which images a scene has, in words for an error."""
-        if of == "gt" and self.has_gt(scene_id):
+        if kind == "gt" and self.has_gt(scene_id):
             return f"ground truth in {self._source.annotation(scene_id, 'gt')}"
         return f"camera in {self._source.annotation(scene_id, 'camera')}"
 
@@ -127,7 +125,7 @@ class BopDataset:
         return self._source.im_ids(scene_id, kind) if self._source.has(scene_id, kind) else []
 
     @cached_property
-    def targets(self) -> list[Target]:
+    def targets(self) -> list[BopTarget]:
         """What is to be found: the split's targets file (BOP19, else BOP24), else all ground truth with a pose.
 
         Targets without an object (BOP24 detection) are filled in from ground truth.
@@ -170,24 +168,24 @@ class BopDataset:
                 raise DatasetError(f"{where}: scene {scene_id} is not in {self.split_path}; download or remove it")
             yield entry, scene_id, im_id, where
 
-    def _listed_targets(self, file: Path) -> Iterator[Target]:
+    def _listed_targets(self, file: Path) -> Iterator[BopTarget]:
         seen: dict[tuple[int, int, int], str] = {}
         for entry, scene_id, im_id, where in self._target_entries(file):
             if "obj_id" not in entry:
                 yield from self._annotated_targets(scene_id, im_id)
                 continue
             count = integer(entry, "inst_count", where) if "inst_count" in entry else 1
-            target = Target(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
+            target = BopTarget(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
             key = (scene_id, im_id, target.obj_id)
             if key in seen:  # its poses would be expected twice
                 raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one of them")
             seen[key] = f"entry {where.rsplit(' ', 1)[-1]}"
             yield target
 
-    def _annotated_targets(self, scene_id: int, im_id: int) -> list[Target]:
+    def _annotated_targets(self, scene_id: int, im_id: int) -> list[BopTarget]:
         found = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
         return [
-            Target(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=found.count(obj_id))
+            BopTarget(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=found.count(obj_id))
             for obj_id in sorted(set(found))
         ]
 
@@ -240,15 +238,7 @@ class BopDataset:
             raise DatasetError(f"{scene}: no image {im_id:06d} as png, jpg or tif in rgb/ or gray/")
         return file
 
-    def image_path(self, scene_id: int, im_id: int) -> Path:
-        """Where the colour (else gray) image lies; the tar file where it is in one.
-
-        Raises:
-            DatasetError: there is none.
-        """
-        return self.image_file(scene_id, im_id).path
-
-    def rgb(self, scene_id: int, im_id: int) -> UInt8[Array, "h w 3"]:
+    def rgb(self, scene_id: int, im_id: int) -> UInt8[np.ndarray, "h w 3"]:
         """The image in RGB; gray is repeated three times."""
         return read_rgb(self.image_file(scene_id, im_id))
 
@@ -257,7 +247,7 @@ class BopDataset:
         self._require(scene_id)
         return self._source.image(scene_id, im_id, "depth")
 
-    def depth_m(self, scene_id: int, im_id: int) -> Float[Array, "h w"] | None:
+    def depth_m(self, scene_id: int, im_id: int) -> Float[np.ndarray, "h w"] | None:
         """Camera z in metres, 0 where unknown; None where the image has no depth file.
 
         What is not finite or below 0 in a floating-point depth image counts as unknown.
@@ -287,7 +277,9 @@ class BopDataset:
         self._require(scene_id)
         return depth_scale(*self._source.entry(scene_id, im_id, "camera"))
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, *, visible: bool = False) -> Bool[Array, "h w"] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, *, visible: bool = False
+    ) -> Bool[np.ndarray, "h w"] | None:
         """Annotated silhouette of an object, whole or its visible part; None where the dataset has none.
 
         Raises:
@@ -298,7 +290,7 @@ class BopDataset:
 
     def mask_and_place(
         self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
-    ) -> tuple[Bool[Array, "h w"], str] | None:
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """As `mask`, with where it lies."""
         self._require(scene_id)
         return self._source.mask(scene_id, im_id, gt_index, kind)

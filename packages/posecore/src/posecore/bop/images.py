@@ -12,7 +12,6 @@ from posecore.bop.file_slice import StoredFile, stored
 from posecore.errors import DatasetError, StorageError
 from posecore.files import write_atomic
 
-Array = np.ndarray
 COLOUR_EXTENSIONS = ("png", "jpg", "jpeg", "tif", "tiff")
 DEPTH_EXTENSIONS = ("png", "tif", "tiff")
 LARGEST_IMAGE_PX = 1 << 28
@@ -30,7 +29,7 @@ def find_image(folders: tuple[Path, ...], name: str, extensions: tuple[str, ...]
     return None
 
 
-def read_image(file: Path | StoredFile, flags: int) -> Shaped[Array, "h w *c"]:
+def read_image(file: Path | StoredFile, flags: int) -> Shaped[np.ndarray, "h w *c"]:
     """Decode an image file with OpenCV's flags, as it is stored (an EXIF turn is ignored); colours in OpenCV's order.
 
     Raises:
@@ -84,7 +83,7 @@ def _whole_png(data: bytes) -> bool:
     return False
 
 
-def read_rgb(file: Path | StoredFile) -> UInt8[Array, "h w 3"]:
+def read_rgb(file: Path | StoredFile) -> UInt8[np.ndarray, "h w 3"]:
     """Read a colour or gray image as 8-bit RGB; 16-bit images are scaled down.
 
     Raises:
@@ -96,7 +95,7 @@ def read_rgb(file: Path | StoredFile) -> UInt8[Array, "h w 3"]:
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def read_depth(file: Path | StoredFile) -> Shaped[Array, "h w"]:
+def read_depth(file: Path | StoredFile) -> Shaped[np.ndarray, "h w"]:
     """Read a depth image's stored numbers.
 
     Raises:
@@ -108,7 +107,7 @@ def read_depth(file: Path | StoredFile) -> Shaped[Array, "h w"]:
     return raw
 
 
-def read_mask(file: Path | StoredFile) -> Bool[Array, "h w"]:
+def read_mask(file: Path | StoredFile) -> Bool[np.ndarray, "h w"]:
     """Read a mask image: true where it is not 0.
 
     Raises:
@@ -152,7 +151,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def write_image(path: Path, image: Shaped[Array, "h w *c"], jpeg_quality: int = 95) -> None:
+def write_image(path: Path, image: Shaped[np.ndarray, "h w *c"], jpeg_quality: int = 95) -> None:
     """Encode by the file's extension and write atomically; three channels are RGB.
 
     Raises:

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from posecore.errors import DatasetError
 from posecore.files import write_atomic
 
-Array = np.ndarray
 LARGEST_INTEGER = 2**63 - 1
 
 
@@ -89,7 +88,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def numbers(entry: Any, key: str, count: int, where: str) -> Float[Array, " n"]:
+def numbers(entry: Any, key: str, count: int, where: str) -> Float[np.ndarray, " n"]:
     """The `count` finite numbers under `entry[key]`: one number, a list, or a list of rows.
 
     Raises:
@@ -155,6 +154,6 @@ def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     return found
 
 
-def as_list(values: Sequence[float] | Float[Array, "..."]) -> list[float]:
+def as_list(values: Sequence[float] | Float[np.ndarray, "..."]) -> list[float]:
     """Plain floats for JSON, row by row."""
     return [float(value) for value in np.asarray(values, dtype=np.float64).reshape(-1)]

@@ -12,7 +12,6 @@ from posecore import se3
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import ResultFileError
 
-Array = np.ndarray
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 HEADER = ",".join(COLUMNS)
 COUNTS = {"R": 9, "t": 3}
@@ -56,18 +55,18 @@ class ResultTable:
         line: line in the file, from 1; 0 where it comes from elsewhere.
     """
 
-    scene_id: Int[Array, " n"]
-    im_id: Int[Array, " n"]
-    obj_id: Int[Array, " n"]
-    score: Float[Array, " n"]
-    T_cam_obj: Float[Array, "n 4 4"]
-    time_s: Float[Array, " n"]
-    line: Int[Array, " n"]
+    scene_id: Int[np.ndarray, " n"]
+    im_id: Int[np.ndarray, " n"]
+    obj_id: Int[np.ndarray, " n"]
+    score: Float[np.ndarray, " n"]
+    T_cam_obj: Float[np.ndarray, "n 4 4"]
+    time_s: Float[np.ndarray, " n"]
+    line: Int[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.scene_id)
 
-    def take(self, index: Int[Array, " m"] | Bool[Array, " n"]) -> "ResultTable":
+    def take(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "ResultTable":
         """The estimates at these positions, or where a mask is true."""
         return ResultTable(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
@@ -125,7 +124,9 @@ def parse_results(data: bytes, name: str, on_fault: Callable[[LineFault], None] 
     return ResultTable.concat(parts)
 
 
-def _table(ids: Int[Array, "n 3"], numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> ResultTable:
+def _table(
+    ids: Int[np.ndarray, "n 3"], numbers: Float[np.ndarray, "n 14"], lines: Int[np.ndarray, " n"]
+) -> ResultTable:
     return ResultTable(
         scene_id=np.ascontiguousarray(ids[:, 0]),
         im_id=np.ascontiguousarray(ids[:, 1]),
@@ -178,7 +179,9 @@ def _chunks(body: bytes, start: int) -> Iterator[tuple[bytes, int]]:
         start = end
 
 
-def _plain_numbers(chunk: bytes, order: tuple[str, ...]) -> tuple[Int[Array, "n 3"], Float[Array, "n 14"]] | None:
+def _plain_numbers(
+    chunk: bytes, order: tuple[str, ...]
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 14"]] | None:
     """Ids and numbers of lines that hold what they should, all at once; None where any may not."""
     plain = chunk.replace(b"\r\n", b"\n")
     if plain.translate(None, _PLAIN):
@@ -217,7 +220,7 @@ def _plain_numbers(chunk: bytes, order: tuple[str, ...]) -> tuple[Int[Array, "n 
 
 def _line_by_line(
     text: str, order: tuple[str, ...], first_line: int
-) -> tuple[Int[Array, "n 3"], Float[Array, "n 14"], Int[Array, " n"], list[LineFault]]:
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 14"], Int[np.ndarray, " n"], list[LineFault]]:
     ids: list[list[int]] = []
     numbers: list[list[float]] = []
     lines: list[int] = []
@@ -278,7 +281,9 @@ def _floats(text: str, count: int, column: str) -> list[float]:
     return values
 
 
-def _valid(numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> tuple[Bool[Array, " n"], list[LineFault]]:
+def _valid(
+    numbers: Float[np.ndarray, "n 14"], lines: Int[np.ndarray, " n"]
+) -> tuple[Bool[np.ndarray, " n"], list[LineFault]]:
     """Which lines hold finite numbers, a rotation and a possible translation, and what is wrong in the others."""
     finite = np.isfinite(numbers)
     good = finite.all(axis=1)
@@ -301,7 +306,7 @@ def _valid(numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> tuple[Bool
     return good & ~far & ~improper, faults
 
 
-def _improper(R: Float[Array, "3 3"]) -> str:
+def _improper(R: Float[np.ndarray, "3 3"]) -> str:
     with np.errstate(over="ignore", invalid="ignore"):
         determinant = float(np.linalg.det(R))
         scale = math.copysign(abs(determinant) ** (1 / 3), determinant) if math.isfinite(determinant) else math.nan

@@ -15,7 +15,6 @@ from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS, find_image,
 from posecore.bop.jsonfile import integer_keys, parse_json
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 Kind = Literal["camera", "gt", "gt_info"]
 Layer = Literal["colour", "depth"]
 MaskKind = Literal["mask", "mask_visib"]
@@ -50,7 +49,9 @@ class Source(Protocol):
         """The image file, or None where there is none."""
         ...
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """An annotated silhouette and where it lies, or None where there is none."""
         ...
 
@@ -170,7 +171,9 @@ class FolderSource:
         path = find_image(tuple(folders), f"{im_id:06d}", extensions)
         return None if path is None else StoredFile(path=path)
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """The mask's PNG."""
         folder = self._paths[scene_id] / self._named(scene_id, kind)
         path = find_image((folder,), f"{im_id:06d}_{gt_index:06d}", ("png",))

@@ -18,7 +18,6 @@ from posecore.bop.jsonfile import integer, integer_keys, parse_json, shown
 from posecore.bop.sources import Kind, Layer, MaskKind, some
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 BLOCK = 512
 LARGEST_MASK_PX = 1 << 28
 _KEY = re.compile(r"([0-9]{1,18})_([0-9]{1,18})")
@@ -111,7 +110,9 @@ class ShardSource:
         choices = (self._stored(scene_id, im_id, f"{name}.{ending}") for name in names for ending in extensions)
         return next((file for file in choices if file is not None), None)
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """The mask from its run lengths."""
         file = self._stored(scene_id, im_id, f"{kind}.json")
         if file is None:
@@ -121,7 +122,7 @@ class ShardSource:
         return None if gt_index not in masks else (decode_runs(masks[gt_index], where), where)
 
 
-def decode_runs(entry: Any, where: str) -> Bool[Array, "h w"]:
+def decode_runs(entry: Any, where: str) -> Bool[np.ndarray, "h w"]:
     """A mask from its run lengths: pixels column by column, off and on in turn, off first (COCO's, uncompressed).
 
     Raises:

@@ -11,7 +11,6 @@ from posecore.config import load_yaml
 from posecore.errors import ShardError
 from posecore.files import data_spec
 
-Array = np.ndarray
 BIT_OBJECT, BIT_VISIBLE, BIT_FOREGROUND = 1, 2, 4
 """Bits of `scene_mask`: the object's whole silhouette, its visible part, and anything in front of the background."""
 
@@ -23,7 +22,7 @@ class Field:
     """One row of the field table.
 
     Attributes:
-        name: Array name in the group; ends in its unit where it has one.
+        name: np.ndarray name in the group; ends in its unit where it has one.
         dtype: On disk.
         shape: Without the sample axis; "P" patch_px, "C" contour_points.
         unit: Of the decoded value.
@@ -64,7 +63,7 @@ class Field:
         """Type of the values that a reader gives."""
         return np.dtype(np.float32) if self.squared or self.scale is not None else np.dtype(self.dtype)
 
-    def encode(self, values: Array, card: Mapping[str, Any]) -> Array:
+    def encode(self, values: np.ndarray, card: Mapping[str, Any]) -> np.ndarray:
         """Values in `unit` to what is stored; rounds to the nearest step and refuses what does not fit."""
         step = self.step(card)
         if self.squared:
@@ -80,7 +79,7 @@ class Field:
             )
         return np.asarray(stored.astype(self.dtype))
 
-    def decode(self, stored: Array, card: Mapping[str, Any], out: Array) -> None:
+    def decode(self, stored: np.ndarray, card: Mapping[str, Any], out: np.ndarray) -> None:
         """What is stored to values in `unit`, into an array of `decoded_dtype`."""
         step = self.step(card)
         if self.squared:
@@ -90,7 +89,7 @@ class Field:
         else:
             out[...] = stored
 
-    def _square(self, values: Array) -> Array:
+    def _square(self, values: np.ndarray) -> np.ndarray:
         square = np.square(values, dtype=np.float32)
         stored = np.rint(square)
         exact = np.abs(square - stored).max() <= _SQUARE_TOLERANCE and stored.max() <= np.iinfo(self.dtype).max

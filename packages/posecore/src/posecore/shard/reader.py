@@ -23,8 +23,6 @@ from posecore.shard.layout import (
 )
 from posecore.store import open_store
 
-Array = np.ndarray
-
 
 class ShardReader:
     """Reads a dataset, complete or still growing.
@@ -69,6 +67,11 @@ class ShardReader:
         """Whether every shard is there."""
         return len(self._lines) == n_shards(self.card)
 
+    @property
+    def manifest_lines(self) -> Mapping[int, Mapping[str, Any]]:
+        """Lines of the manifest by shard id, sorted."""
+        return {shard_id: self._lines[shard_id] for shard_id in self.committed}
+
     def n_samples(self, shard_id: int) -> int:
         """Samples in a shard."""
         return samples_in(self.card, shard_id)
@@ -90,7 +93,7 @@ class ShardReader:
             raise ShardError(f"{self.url}/{key}: missing from the dataset; render it again")
         return data
 
-    def read(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, Array]:
+    def read(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Decode a whole shard, or some of its fields, into physical units.
 
         Every chunk is held against its CRC-32C.
@@ -126,7 +129,7 @@ class ShardReader:
             )
         return data
 
-    def _decode(self, field: Field, shard_id: int, data: bytes) -> Array:
+    def _decode(self, field: Field, shard_id: int, data: bytes) -> np.ndarray:
         chunk, *size = chunk_shape(field, self.card)
         values = np.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
         for first in range(0, len(values), chunk):

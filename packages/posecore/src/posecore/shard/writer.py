@@ -25,8 +25,6 @@ from posecore.shard.layout import (
 )
 from posecore.store import open_store
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
@@ -104,7 +102,7 @@ class ShardWriter:
                     found.setdefault(line["shard"], f"{key} {there}, expected {expected} bytes")
         return found
 
-    def encode(self, shard_id: int, arrays: Mapping[str, Array]) -> Encoded:
+    def encode(self, shard_id: int, arrays: Mapping[str, np.ndarray]) -> Encoded:
         """Compress one shard; needs no store, so workers do it.
 
         Args:
@@ -147,7 +145,7 @@ def _line_text(line: Mapping[str, Any]) -> str:
     return json.dumps(line, sort_keys=True) + "\n"
 
 
-def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) -> Encoded:
+def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, np.ndarray]) -> Encoded:
     """Compress one shard of the dataset with this card. See `ShardWriter.encode`."""
     count = samples_in(card, shard_id)
     packed: dict[str, bytes] = {}
