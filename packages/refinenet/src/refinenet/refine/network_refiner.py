@@ -14,13 +14,13 @@ from posecore import se3
 from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import Mesh
 
+from refinenet.batch import NetworkInput
 from refinenet.device import choose_device
 from refinenet.errors import RefinementError
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.image.edge_gradients import gradient_similarity
 from refinenet.models import checkpoint
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.models.networks import Pair
 from refinenet.refine.input_checks import require_trained
 from refinenet.refine.patches import Patches, PatchRenderer
 from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, require_meshes
@@ -97,7 +97,7 @@ class Refiner:
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
-        self._sees_depth = loaded.provenance.config.network.sees_depth
+        self._sees_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
         self.patch_renderer = PatchRenderer(meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
@@ -138,7 +138,7 @@ class Refiner:
     @property
     def predicts_pose_quality(self) -> bool:
         """Whether confidences come from an output that was trained on the pose error."""
-        return self.scorer == "learned" and self.checkpoint.provenance.config.loss.confidence_target == "closeness"
+        return self.scorer == "learned" and self.checkpoint.provenance.config.loss.confidence_target == "pose_quality"
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -291,7 +291,7 @@ class Refiner:
 
     def _forward(self, patches: Patches, T: Float[Array, "s 4 4"], first: int) -> PoseUpdate:
         part = slice(first, first + self._batch)
-        pair = Pair(
+        pair = NetworkInput(
             scene_rgb=self._tensor(patches.scene_rgb[part].transpose(0, 3, 1, 2)),
             hypothesis_rgb=self._tensor(patches.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
             T_cam_obj=self._tensor(T[part].astype(np.float32)),
