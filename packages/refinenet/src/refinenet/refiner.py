@@ -14,7 +14,6 @@ from posecore.mesh import Mesh
 
 from refinenet.errors import RefinementError
 
-Array = np.ndarray
 HypothesisScorer = Literal["gradient", "learned", "none"]
 """Ranking of a hypothesis set before refinement: image gradients, the network's confidence, or no ranking."""
 ScoreKind = Literal["learned", "gradients", "search", "none"]
@@ -60,9 +59,9 @@ class Frame:
         CameraError: K is no camera matrix, or that of an image of another size.
     """
 
-    image: UInt8[Array, "h w 3"]
-    K: Float[Array, "3 3"]
-    depth_m: Float[Array, "h w"] | None = None
+    image: UInt8[np.ndarray, "h w 3"]
+    K: Float[np.ndarray, "3 3"]
+    depth_m: Float[np.ndarray, "h w"] | None = None
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image)
@@ -91,7 +90,7 @@ class Request:
     """A pose to refine: object and initial pose (metres, object to camera)."""
 
     obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +107,7 @@ class Refinement:
             from a local method.
     """
 
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     status: Status
     iterations: int
     confidence: float | None = None
@@ -121,7 +120,7 @@ class Refinement:
         return self.status is Status.FAILED
 
 
-def render_obstacle(T_cam_obj: Float[Array, "4 4"], mesh: Mesh) -> str | None:
+def render_obstacle(T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh) -> str | None:
     """Reason why an object cannot be rendered at a pose (metres) in any image; None where it can."""
     if not np.isfinite(T_cam_obj).all():
         return "its pose is not finite"

@@ -13,7 +13,6 @@ from posecore.raster import Rasteriser
 from refinenet.baselines.patch import TrackedObject
 from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, render_obstacle, require_meshes
 
-Array = np.ndarray
 SMALL_ANGLE_RAD = np.deg2rad(0.5)
 SMALL_DISTANCE = 0.01
 """An update below this angle and this fraction of the diameter is small."""
@@ -57,7 +56,9 @@ class Baseline(ABC):
             self._refine_if_renderable(frame, request.T_cam_obj, self._tracked_object(request)) for request in requests
         ]
 
-    def _refine_if_renderable(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement:
+    def _refine_if_renderable(
+        self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject
+    ) -> Refinement:
         """Refine a pose; one that cannot be rendered fails."""
         obstacle = render_obstacle(T_cam_obj, target.mesh)
         return failed(T_cam_obj, 0, obstacle) if obstacle else self._refine(frame, T_cam_obj, target)
@@ -70,19 +71,19 @@ class Baseline(ABC):
         self._rasteriser.close()
 
     @abstractmethod
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement: ...
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement: ...
 
 
-def failed(initial: Float[Array, "4 4"], iterations: int, reason: str) -> Refinement:
+def failed(initial: Float[np.ndarray, "4 4"], iterations: int, reason: str) -> Refinement:
     """A failure: the initial pose and the reason."""
     T = np.asarray(initial, np.float64)
     return Refinement(T_cam_obj=T, status=Status.FAILED, iterations=iterations, failure=reason)
 
 
 def refined(
-    initial: Float[Array, "4 4"],
-    before: Float[Array, "4 4"],
-    after: Float[Array, "4 4"],
+    initial: Float[np.ndarray, "4 4"],
+    before: Float[np.ndarray, "4 4"],
+    after: Float[np.ndarray, "4 4"],
     iterations: int,
     diameter_m: float,
 ) -> Refinement:

@@ -9,10 +9,9 @@ from posecore.camera import back_project
 from posecore.errors import DatasetError
 
 from refinenet.baselines.base import NOT_VISIBLE, Baseline, failed, refined
-from refinenet.baselines.patch import Patch, TrackedObject, finest_px, nearest_pixels, render_and_crop
+from refinenet.baselines.patch import ObjectPatch, TrackedObject, finest_px, nearest_pixels, render_and_crop
 from refinenet.refiner import Frame, Refinement
 
-Array = np.ndarray
 REACH = (0.3, 0.15, 0.08, 0.04)
 """Largest correspondence distances, one after the other, as fractions of the diameter. Like all below: tuned on
 renders."""
@@ -34,7 +33,7 @@ class DepthIcp(Baseline):
     name = "depth-icp"
     needs_depth = True
 
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement:
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement:
         if frame.depth_m is None:
             raise DatasetError("depth-icp needs depth, and this image has none; use edge-icp or region for RGB")
         return refine_by_depth(frame, frame.depth_m, T_cam_obj, target, self.iterations)
@@ -44,16 +43,16 @@ class DepthIcp(Baseline):
 class Attempt:
     """An ICP run: pose, pose before the last update, updates, and fraction of the render that the depth confirms."""
 
-    pose: Float[Array, "4 4"]
-    before: Float[Array, "4 4"]
+    pose: Float[np.ndarray, "4 4"]
+    before: Float[np.ndarray, "4 4"]
     iterations: int
     support: float
 
 
 def refine_by_depth(
     frame: Frame,
-    depth_m: Float[Array, "h w"],
-    T_cam_obj: Float[Array, "4 4"],
+    depth_m: Float[np.ndarray, "h w"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
     target: TrackedObject,
     iterations: int = 5,
 ) -> Refinement:
@@ -81,19 +80,19 @@ def refine_by_depth(
     return refined(T_cam_obj, best.before, best.pose, best.iterations, target.mesh.diameter_m)
 
 
-def _patch(frame: Frame, pose: Float[Array, "4 4"], target: TrackedObject) -> Patch | None:
+def _patch(frame: Frame, pose: Float[np.ndarray, "4 4"], target: TrackedObject) -> ObjectPatch | None:
     patch_px = finest_px(frame.K, pose, target.mesh, PATCH_PX)
     return render_and_crop(frame.image, frame.K, pose, target, patch_px) if patch_px else None
 
 
-def _scene_depth_m(patch: Patch, depth_m: Float[Array, "h w"]) -> Float[Array, "p p"]:
+def _scene_depth_m(patch: ObjectPatch, depth_m: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "p p"]:
     """Depth of the image pixel nearest to each patch pixel; 0 outside the image."""
     return np.where(patch.visible, nearest_pixels(depth_m, patch.window, len(patch.depth_m)), 0.0)
 
 
 def _shifted_to_surface(
-    pose: Float[Array, "4 4"], patch: Patch, scene_m: Float[Array, "p p"], diameter_m: float
-) -> Float[Array, "4 4"]:
+    pose: Float[np.ndarray, "4 4"], patch: ObjectPatch, scene_m: Float[np.ndarray, "p p"], diameter_m: float
+) -> Float[np.ndarray, "4 4"]:
     """The pose shifted along its ray by the median gap between rendered and measured depth."""
     both = patch.mask & (scene_m > 0)
     gap_m = (scene_m - patch.depth_m)[both]
@@ -105,7 +104,11 @@ def _shifted_to_surface(
 
 
 def _run(
-    frame: Frame, depth_m: Float[Array, "h w"], initial: Float[Array, "4 4"], target: TrackedObject, iterations: int
+    frame: Frame,
+    depth_m: Float[np.ndarray, "h w"],
+    initial: Float[np.ndarray, "4 4"],
+    target: TrackedObject,
+    iterations: int,
 ) -> Attempt | None:
     """ICP with shrinking correspondence distance; None if the object is not visible or there is no depth near it."""
     pose = before = initial
@@ -131,8 +134,12 @@ def _run(
 
 
 def _align(
-    patch: Patch, scene_m: Float[Array, "p p"], pose: Float[Array, "4 4"], reach_m: float, diameter_m: float
-) -> Float[Array, "4 4"] | None:
+    patch: ObjectPatch,
+    scene_m: Float[np.ndarray, "p p"],
+    pose: Float[np.ndarray, "4 4"],
+    reach_m: float,
+    diameter_m: float,
+) -> Float[np.ndarray, "4 4"] | None:
     """An alignment of the visible surface with the scene's points near the object."""
     model = _points(patch, patch.depth_m.astype(np.float64), MODEL_POINTS)
     scene = _points(patch, scene_m.astype(np.float64), SCENE_POINTS)
@@ -159,7 +166,7 @@ def _align(
     return np.asarray(about_origin @ result.T_target_source @ back @ pose)
 
 
-def _points(patch: Patch, depth_m: Float[Array, "p p"], n: int) -> Float[Array, "m 3"]:
+def _points(patch: ObjectPatch, depth_m: Float[np.ndarray, "p p"], n: int) -> Float[np.ndarray, "m 3"]:
     """At most `n` points of a depth patch, evenly over its pixels."""
     pixels = np.argwhere(depth_m > 0)
     if len(pixels) > n:

@@ -15,7 +15,7 @@ from refinenet.baselines.gauss_newton import apply_step, projection_jacobian, st
 from refinenet.baselines.patch import (
     EDGE_BLUR_PX,
     Edges,
-    Patch,
+    ObjectPatch,
     TrackedObject,
     finest_px,
     inner_edges,
@@ -24,7 +24,6 @@ from refinenet.baselines.patch import (
 )
 from refinenet.refiner import Frame, Refinement
 
-Array = np.ndarray
 LEVELS = ((0.35, 0.12), (0.6, 0.07), (1.0, 0.035))
 """Patch side as a fraction of the finest, search range as a fraction of that side. Like all below: tuned on renders."""
 FINEST_PX = 256
@@ -56,14 +55,14 @@ class EdgeIcp(Baseline):
 
     name = "edge-icp"
 
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement:
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement:
         return refine_by_edges(frame.image, frame.K, T_cam_obj, target, self.iterations)
 
 
 def refine_by_edges(
-    image: UInt8[Array, "h w 3"],
-    K: Float[Array, "3 3"],
-    T_cam_obj: Float[Array, "4 4"],
+    image: UInt8[np.ndarray, "h w 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
     target: TrackedObject,
     iterations: int = 5,
 ) -> Refinement:
@@ -115,12 +114,12 @@ class Matches:
     """
 
     edges: Edges
-    offset_px: Float[Array, "n k"]
-    score: Float[Array, "n k"]
-    exists: Bool[Array, "n k"]
+    offset_px: Float[np.ndarray, "n k"]
+    score: Float[np.ndarray, "n k"]
+    exists: Bool[np.ndarray, "n k"]
 
 
-def match_edges(patch: Patch, reach_px: float) -> Matches:
+def match_edges(patch: ObjectPatch, reach_px: float) -> Matches:
     """Image edges on the normals of the render's edges, at most `reach_px` away."""
     outline = silhouette_edges(patch, SILHOUETTE_POINTS)
     inner, colour_step = inner_edges(patch, INNER_POINTS, MIN_GRADIENT)
@@ -152,8 +151,8 @@ def match_edges(patch: Patch, reach_px: float) -> Matches:
 
 
 def _gradients_at(
-    patch: Patch, uv_px: Float[Array, "n s 2"], normal: Float[Array, "n 2"]
-) -> tuple[Float[Array, "n s 3"], Float[Array, "n s 3"]]:
+    patch: ObjectPatch, uv_px: Float[np.ndarray, "n s 2"], normal: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "n s 3"], Float[np.ndarray, "n s 3"]]:
     """Gradient of the blurred image along and across the normal, per channel, grey levels a pixel."""
     smooth = cv2.GaussianBlur(patch.scene_rgb.astype(np.float32), (0, 0), EDGE_BLUR_PX)
     position = (uv_px - 0.5).astype(np.float32)
@@ -172,8 +171,8 @@ def _gradients_at(
 
 
 def align(
-    pose: Float[Array, "4 4"], K: Float[Array, "3 3"], matches: Matches, reach_px: float, length_m: float
-) -> Float[Array, "4 4"]:
+    pose: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"], matches: Matches, reach_px: float, length_m: float
+) -> Float[np.ndarray, "4 4"]:
     """The pose that aligns each edge with a candidate: at first with the likeliest, then with the nearest."""
     edges, exists = matches.edges, matches.exists
     by_pose = projection_jacobian(K, edges.p_cam_m, pose[:3, 3], length_m)

@@ -4,14 +4,13 @@ import numpy as np
 from jaxtyping import Float
 from posecore import se3
 
-Array = np.ndarray
 TUKEY = 4.6851
 """Width of Tukey's weight in standard deviations, for 95 % efficiency on normally distributed residuals."""
 
 
 def projection_jacobian(
-    K: Float[Array, "3 3"], p_cam_m: Float[Array, "n 3"], origin_m: Float[Array, "3"], length_m: float
-) -> Float[Array, "n 2 6"]:
+    K: Float[np.ndarray, "3 3"], p_cam_m: Float[np.ndarray, "n 3"], origin_m: Float[np.ndarray, "3"], length_m: float
+) -> Float[np.ndarray, "n 2 6"]:
     """Jacobian of the projections of surface points with respect to the object's pose.
 
     Args:
@@ -40,8 +39,8 @@ def projection_jacobian(
 
 
 def step(
-    J: Float[Array, "n 6"], residual: Float[Array, " n"], weight: Float[Array, " n"], damping: float
-) -> Float[Array, "6"]:
+    J: Float[np.ndarray, "n 6"], residual: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], damping: float
+) -> Float[np.ndarray, "6"]:
     """The x that minimises sum w (r + J x)^2, damped.
 
     Args:
@@ -55,11 +54,13 @@ def step(
     return np.asarray(np.linalg.solve(H + (damping * np.trace(H) / 6 + 1e-12) * np.eye(6), -J.T @ (weight * residual)))
 
 
-def apply_step(T_cam_obj: Float[Array, "4 4"], x: Float[Array, "6"], length_m: float) -> Float[Array, "4 4"]:
+def apply_step(
+    T_cam_obj: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "6"], length_m: float
+) -> Float[np.ndarray, "4 4"]:
     """The pose after a step x of `step`, whose translation is in units of `length_m`."""
     return se3.apply_update(T_cam_obj, se3.rotation_from_rotvec(x[:3]), x[3:] * length_m)
 
 
-def tukey_weight(residual: Float[Array, " n"], sigma: float) -> Float[Array, " n"]:
+def tukey_weight(residual: Float[np.ndarray, " n"], sigma: float) -> Float[np.ndarray, " n"]:
     """Tukey's biweight: 1 for no residual, 0 from 4.7 standard deviations on."""
     return np.square(1 - np.square(residual / (TUKEY * sigma)).clip(0, 1))

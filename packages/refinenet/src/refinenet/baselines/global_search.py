@@ -29,14 +29,13 @@ from posecore.simplify import simplified
 
 from refinenet.baselines.base import Baseline, failed
 from refinenet.baselines.edge_icp import refine_by_edges
-from refinenet.baselines.patch import Patch, TrackedObject, render_and_crop
+from refinenet.baselines.patch import ObjectPatch, TrackedObject, render_and_crop
 from refinenet.baselines.pose_sampling import PoseSampler, prior_distance
 from refinenet.baselines.search_config import SearchConfig
 from refinenet.baselines.viewpoint_model import ViewpointModel, make_viewpoint_model
 from refinenet.image.edge_gradients import SCENE_EDGE, gradient_similarity, orientation_gradients
 from refinenet.refiner import Frame, NetworkRefiner, Refinement, Request, ScoreKind, Status
 
-Array = np.ndarray
 DEFAULTS = SearchConfig()
 
 
@@ -114,7 +113,7 @@ class GradientSearch(Baseline):
                     results[i] = _better(result, self._refine_if_renderable(frame, request.T_cam_obj, target))
         return results
 
-    def _known_depth_m(self, frame: Frame, request: Request, refined: Sequence[Request]) -> Float[Array, "h w"]:
+    def _known_depth_m(self, frame: Frame, request: Request, refined: Sequence[Request]) -> Float[np.ndarray, "h w"]:
         """Camera z of refined poses beside a requested object, 0 elsewhere.
 
         Poses of the same object near the initial pose are left out: they may be the same instance, reached from another
@@ -133,7 +132,7 @@ class GradientSearch(Baseline):
             return np.zeros((height_px, width_px), np.float32)
         return self._simplified.render_scene(occluders, frame.K, width_px, height_px, rgb=False).depth_m
 
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement:
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement:
         config = self._config
         initial = np.ascontiguousarray(T_cam_obj, np.float64)
         patch = render_and_crop(frame.image, frame.K, initial, target, config.patch_px, config.window_scale)
@@ -167,7 +166,9 @@ class GradientSearch(Baseline):
             self._models[target.obj_id] = make_viewpoint_model(target.obj_id, mesh, self._simplified)
         return self._models[target.obj_id]
 
-    def _by_edges(self, frame: Frame, pose: Float[Array, "4 4"], target: TrackedObject, iterations: int) -> Refinement:
+    def _by_edges(
+        self, frame: Frame, pose: Float[np.ndarray, "4 4"], target: TrackedObject, iterations: int
+    ) -> Refinement:
         """Edge ICP from a pose; the pose itself where that has the higher similarity."""
         by_edges = refine_by_edges(frame.image, frame.K, pose, target, iterations)
         before = similarity_at(frame, pose, target, self._config)
@@ -213,7 +214,7 @@ def _final_score(result: Refinement) -> float:
 
 
 def similarity_at(
-    frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject, config: SearchConfig = DEFAULTS
+    frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject, config: SearchConfig = DEFAULTS
 ) -> float:
     """Gradient similarity of image and render at a pose, in [0, 1]; 0 where the object is not visible."""
     patch = render_and_crop(frame.image, frame.K, T_cam_obj, target, config.score_patch_px)
@@ -223,13 +224,13 @@ def similarity_at(
 
 
 def search(
-    patch: Patch,
-    initial: Float[Array, "4 4"],
+    patch: ObjectPatch,
+    initial: Float[np.ndarray, "4 4"],
     mesh: Mesh,
     model: ViewpointModel,
     rng: np.random.Generator,
     config: SearchConfig = DEFAULTS,
-) -> list[Float[Array, "4 4"]]:
+) -> list[Float[np.ndarray, "4 4"]]:
     """Poses with a high edge similarity that differ from each other, the best first.
 
     Args:
@@ -242,13 +243,15 @@ def search(
     """
     responses = {spread: response_maps(patch, spread, config.orientations) for spread in config.spreads_px}
 
-    def score(T_cam_obj: Float[Array, "n 4 4"], spread_px: int) -> Float[Array, " n"]:
+    def score(T_cam_obj: Float[np.ndarray, "n 4 4"], spread_px: int) -> Float[np.ndarray, " n"]:
         return model.similarity(T_cam_obj, patch.K, patch.occluder_depth_m, responses[spread_px])
 
     return PoseSampler(initial, mesh, score, config, rng).candidates()
 
 
-def response_maps(patch: Patch, spread_px: int, orientations: int = DEFAULTS.orientations) -> Float[Array, "o p p"]:
+def response_maps(
+    patch: ObjectPatch, spread_px: int, orientations: int = DEFAULTS.orientations
+) -> Float[np.ndarray, "o p p"]:
     """Similarity of each edge orientation to the image's edges within `spread_px`, in [0, 1]."""
     unit, strength = orientation_gradients(patch.scene_rgb[None].astype(np.float32))
     x, y = unit[0, ..., 0], unit[0, ..., 1]

@@ -14,7 +14,6 @@ from scipy.special import ndtri
 
 from refinenet.refiner import render_obstacle
 
-Array = np.ndarray
 WINDOW_SCALE = 1.6
 """Window side over the projected diameter: room for a search of 0.3 diameters on each side."""
 MIN_SIDE_PX = 12.0
@@ -36,11 +35,11 @@ class TrackedObject:
     obj_id: int
     mesh: Mesh
     rasteriser: Rasteriser
-    known_depth_m: Float[Array, "h w"] | None = None
+    known_depth_m: Float[np.ndarray, "h w"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Patch:
+class ObjectPatch:
     """A square patch of p x p pixels at a pose.
 
     Attributes:
@@ -53,16 +52,16 @@ class Patch:
         visible: Patch pixels in the image without a known occluder in front of the object.
     """
 
-    K: Float[Array, "3 3"]
+    K: Float[np.ndarray, "3 3"]
     window: Window
-    depth_m: Float[Array, "p p"]
-    rgb: UInt8[Array, "p p 3"]
-    scene_rgb: UInt8[Array, "p p 3"]
-    occluder_depth_m: Float[Array, "p p"]
-    visible: Bool[Array, "p p"]
+    depth_m: Float[np.ndarray, "p p"]
+    rgb: UInt8[np.ndarray, "p p 3"]
+    scene_rgb: UInt8[np.ndarray, "p p 3"]
+    occluder_depth_m: Float[np.ndarray, "p p"]
+    visible: Bool[np.ndarray, "p p"]
 
     @property
-    def mask(self) -> Bool[Array, "p p"]:
+    def mask(self) -> Bool[np.ndarray, "p p"]:
         """Silhouette of the render."""
         return self.depth_m > 0
 
@@ -77,12 +76,12 @@ class Edges:
         normal: (n, 2) unit vectors across the edge.
     """
 
-    p_cam_m: Float[Array, "n 3"]
-    uv_px: Float[Array, "n 2"]
-    normal: Float[Array, "n 2"]
+    p_cam_m: Float[np.ndarray, "n 3"]
+    uv_px: Float[np.ndarray, "n 2"]
+    normal: Float[np.ndarray, "n 2"]
 
 
-def finest_px(K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh, at_most_px: int) -> int:
+def finest_px(K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh, at_most_px: int) -> int:
     """Side of the finest useful patch: the image's resolution, at most `at_most_px`; 0 where the object is not visible.
 
     A pose that cannot be rendered (`render_obstacle`) or is too far away is not visible.
@@ -94,13 +93,13 @@ def finest_px(K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh
 
 
 def render_and_crop(
-    image: UInt8[Array, "h w 3"],
-    K: Float[Array, "3 3"],
-    T_cam_obj: Float[Array, "4 4"],
+    image: UInt8[np.ndarray, "h w 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
     target: TrackedObject,
     patch_px: int,
     scale: float = WINDOW_SCALE,
-) -> Patch | None:
+) -> ObjectPatch | None:
     """The patch around a pose, `scale` projected diameters wide; None where no pixel of the object is visible."""
     if not finest_px(K, T_cam_obj, target.mesh, patch_px):
         return None
@@ -120,7 +119,7 @@ def render_and_crop(
     visible = occluder_depth_m > np.where(mask, depth_m, centre_z_m)
     if not (mask & visible).any():
         return None
-    return Patch(
+    return ObjectPatch(
         K=K_patch,
         window=window,
         depth_m=depth_m,
@@ -131,7 +130,7 @@ def render_and_crop(
     )
 
 
-def nearest_pixels(values: Shaped[Array, "h w"], window: Window, patch_px: int) -> Shaped[Array, "p p"]:
+def nearest_pixels(values: Shaped[np.ndarray, "h w"], window: Window, patch_px: int) -> Shaped[np.ndarray, "p p"]:
     """Image values at the pixel nearest to each patch pixel of a window; outside the image, those of its border."""
     centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
     rows = np.floor(window.y0_px + centre).astype(int).clip(0, values.shape[0] - 1)
@@ -139,7 +138,7 @@ def nearest_pixels(values: Shaped[Array, "h w"], window: Window, patch_px: int) 
     return np.asarray(values[rows[:, None], columns])
 
 
-def silhouette_edges(patch: Patch, n: int) -> Edges:
+def silhouette_edges(patch: ObjectPatch, n: int) -> Edges:
     """At most `n` points evenly along the visible silhouette, normals outwards.
 
     Contour pixels lie on the object, the edge at most half a pixel outside their centres. The blurred silhouette gives
@@ -160,17 +159,19 @@ def silhouette_edges(patch: Patch, n: int) -> Edges:
     )
 
 
-def _even(length: int, n: int) -> Int[Array, " m"]:
+def _even(length: int, n: int) -> Int[np.ndarray, " m"]:
     """At most `n` indices, evenly spread over `length`."""
     return np.arange(length) if length <= n else (np.arange(n) * (length / n)).astype(int)
 
 
-def _unit(vectors: Float[Array, "n 2"]) -> Float[Array, "n 2"]:
+def _unit(vectors: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 1e-9)
 
 
-def channel_gradients_at(channels: Float[Array, "h w c"], pixels: Int[Array, "n 2"]) -> Float[Array, "n c 2"]:
+def channel_gradients_at(
+    channels: Float[np.ndarray, "h w c"], pixels: Int[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n c 2"]:
     """(d/dx, d/dy) of every channel at pixels (row, column), by central differences."""
     padded = cv2.copyMakeBorder(channels, 1, 1, 1, 1, cv2.BORDER_REPLICATE).reshape(
         channels.shape[0] + 2, channels.shape[1] + 2, -1
@@ -181,7 +182,7 @@ def channel_gradients_at(channels: Float[Array, "h w c"], pixels: Int[Array, "n 
     return np.stack([dx, dy], -1).astype(np.float64) / 2
 
 
-def inner_edges(patch: Patch, n: int, min_gradient: float) -> tuple[Edges, Float[Array, "n c"]]:
+def inner_edges(patch: ObjectPatch, n: int, min_gradient: float) -> tuple[Edges, Float[np.ndarray, "n c"]]:
     """At most `n` points evenly over the render's edges inside the silhouette: creases, colours, steps in depth.
 
     Args:

@@ -13,8 +13,7 @@ from posecore.mesh import Mesh
 
 from refinenet.baselines.search_config import Round, SearchConfig
 
-Array = np.ndarray
-Score = Callable[[Float[Array, "n 4 4"], int], Float[Array, " n"]]
+Score = Callable[[Float[np.ndarray, "n 4 4"], int], Float[np.ndarray, " n"]]
 """Scores of poses, for an image edge's reach in pixels."""
 
 
@@ -30,7 +29,12 @@ class PoseSampler:
     """
 
     def __init__(
-        self, initial: Float[Array, "4 4"], mesh: Mesh, score: Score, config: SearchConfig, rng: np.random.Generator
+        self,
+        initial: Float[np.ndarray, "4 4"],
+        mesh: Mesh,
+        score: Score,
+        config: SearchConfig,
+        rng: np.random.Generator,
     ) -> None:
         self._initial = initial
         self._mesh = mesh
@@ -38,7 +42,7 @@ class PoseSampler:
         self._config = config
         self._rng = rng
 
-    def candidates(self) -> list[Float[Array, "4 4"]]:
+    def candidates(self) -> list[Float[np.ndarray, "4 4"]]:
         """Poses with a high score that differ from each other, the best first."""
         config = self._config
         first = sample_offsets(config, self._rng)
@@ -53,8 +57,8 @@ class PoseSampler:
         return [offset_poses(self._initial, best, self._mesh)[0] for best, _, _ in locally]
 
     def resample(
-        self, offsets: Float[Array, "m 6"], std: Float[Array, "6"], rounds: Sequence[Round]
-    ) -> tuple[Float[Array, "k 6"], Float[Array, " k"], Float[Array, "6"]]:
+        self, offsets: Float[np.ndarray, "m 6"], std: Float[np.ndarray, "6"], rounds: Sequence[Round]
+    ) -> tuple[Float[np.ndarray, "k 6"], Float[np.ndarray, " k"], Float[np.ndarray, "6"]]:
         """Draw around offsets and keep the best, round by round.
 
         Returns:
@@ -67,13 +71,13 @@ class PoseSampler:
             std = std * self._config.std_decay
         return offsets, scores, std
 
-    def _best(self, offsets: Float[Array, "n 6"], kept: int, spread_px: int) -> tuple[Array, Array]:
+    def _best(self, offsets: Float[np.ndarray, "n 6"], kept: int, spread_px: int) -> tuple[np.ndarray, np.ndarray]:
         scores = self._score(offset_poses(self._initial, offsets, self._mesh), spread_px)
         order = np.argsort(-scores, kind="stable")[:kept]
         return offsets[order], scores[order]
 
 
-def sample_offsets(config: SearchConfig, rng: np.random.Generator) -> Float[Array, "n 6"]:
+def sample_offsets(config: SearchConfig, rng: np.random.Generator) -> Float[np.ndarray, "n 6"]:
     """Rotations about a random axis by at most the largest angle, and normal shifts; the first offset is zero."""
     draws = config.initial_round.draws
     axis = rng.normal(size=(draws, 3))
@@ -84,7 +88,9 @@ def sample_offsets(config: SearchConfig, rng: np.random.Generator) -> Float[Arra
     return np.asarray(offsets)
 
 
-def offset_poses(initial: Float[Array, "4 4"], offsets: Float[Array, "n 6"], mesh: Mesh) -> Float[Array, "n 4 4"]:
+def offset_poses(
+    initial: Float[np.ndarray, "4 4"], offsets: Float[np.ndarray, "n 6"], mesh: Mesh
+) -> Float[np.ndarray, "n 4 4"]:
     """Poses at offsets: rotated about the mesh's centre, shifted across the image, scaled in depth along the ray."""
     centre_m = mesh.center_cam_m(initial)
     across_m = np.pad(mesh.diameter_m * offsets[:, 3:5], ((0, 0), (0, 1)))
@@ -93,7 +99,7 @@ def offset_poses(initial: Float[Array, "4 4"], offsets: Float[Array, "n 6"], mes
     return se3.make_T(R, t)
 
 
-def distinct_poses(T_cam_obj: Float[Array, "n 4 4"], mesh: Mesh, config: SearchConfig) -> list[int]:
+def distinct_poses(T_cam_obj: Float[np.ndarray, "n 4 4"], mesh: Mesh, config: SearchConfig) -> list[int]:
     """Indices of the first poses that lie at least the candidates' distance from all chosen poses before."""
     points_m = se3.apply(T_cam_obj, mesh.center_m + 0.3 * mesh.diameter_m * se3.even_directions(32))
     chosen: list[int] = []
@@ -107,7 +113,7 @@ def distinct_poses(T_cam_obj: Float[Array, "n 4 4"], mesh: Mesh, config: SearchC
 
 
 def prior_distance(
-    initial: Float[Array, "4 4"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh, config: SearchConfig
+    initial: Float[np.ndarray, "4 4"], T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh, config: SearchConfig
 ) -> float:
     """Squared distance of a pose from the initial pose, in standard deviations of the first draws."""
     initial_m, centre_m = mesh.center_cam_m(initial), mesh.center_cam_m(T_cam_obj)

@@ -14,10 +14,9 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from refinenet.baselines.base import NOT_VISIBLE, Baseline, failed, refined
 from refinenet.baselines.gauss_newton import apply_step, projection_jacobian, step
-from refinenet.baselines.patch import Patch, TrackedObject, finest_px, render_and_crop
+from refinenet.baselines.patch import ObjectPatch, TrackedObject, finest_px, render_and_crop
 from refinenet.refiner import Frame, Refinement
 
-Array = np.ndarray
 LEVELS = ((0.3, 0.09), (0.55, 0.045), (1.0, 0.01))
 """Patch side as a fraction of the finest, and the margin along the silhouette that the histograms leave out, as a
 fraction of that side. Like all below: tuned on renders."""
@@ -44,7 +43,7 @@ class RegionTracker(Baseline):
 
     name = "region"
 
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: TrackedObject) -> Refinement:
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement:
         return refine_by_regions(frame.image, frame.K, T_cam_obj, target, self.iterations)
 
 
@@ -52,17 +51,17 @@ class RegionTracker(Baseline):
 class Colours:
     """Colour histograms of object and background: (BINS, BINS, BINS) frequencies that sum to 1."""
 
-    object: Float[Array, "bins bins bins"]
-    background: Float[Array, "bins bins bins"]
+    object: Float[np.ndarray, "bins bins bins"]
+    background: Float[np.ndarray, "bins bins bins"]
 
-    def posterior(self, rgb: UInt8[Array, "h w 3"]) -> Float[Array, "h w"]:
+    def posterior(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
         """Posterior probability of the object at each pixel, with equal priors."""
         r, g, b = np.moveaxis(rgb.astype(np.int64) * BINS // 256, -1, 0)
         inside, outside = self.object[r, g, b], self.background[r, g, b]
         return np.asarray((inside + 1e-6) / (inside + outside + 2e-6))
 
 
-def learn_colours(patch: Patch, margin_px: float) -> Colours | None:
+def learn_colours(patch: ObjectPatch, margin_px: float) -> Colours | None:
     """Histograms inside and outside the silhouette; None where a side has too few pixels.
 
     A margin on either side of the silhouette's edge is left out. Where the silhouette is a little off, each margin has
@@ -80,7 +79,7 @@ def learn_colours(patch: Patch, margin_px: float) -> Colours | None:
     )
 
 
-def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
+def _histogram(rgb: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "bins bins bins"]:
     index = rgb.astype(np.int64) * BINS // 256
     counts = np.bincount(index @ np.array([BINS * BINS, BINS, 1]), minlength=BINS**3).reshape(BINS, BINS, BINS)
     smooth = gaussian_filter(counts.astype(np.float64), 0.7)
@@ -88,9 +87,9 @@ def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
 
 
 def refine_by_regions(
-    image: UInt8[Array, "h w 3"],
-    K: Float[Array, "3 3"],
-    T_cam_obj: Float[Array, "4 4"],
+    image: UInt8[np.ndarray, "h w 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
     target: TrackedObject,
     iterations: int = 5,
 ) -> Refinement:
@@ -135,12 +134,12 @@ def refine_by_regions(
     return refined(T_cam_obj, before, pose, done, target.mesh.diameter_m)
 
 
-def _as_image(probable: Float[Array, "h w"]) -> UInt8[Array, "h w 3"]:
+def _as_image(probable: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
     """Posteriors as grey levels, to crop and resample like an image: colours are classified before blending."""
     return np.repeat(np.round(255 * probable).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def signed_distance_px(mask: Bool[Array, "p p"]) -> tuple[Float[Array, "p p"], Array]:
+def signed_distance_px(mask: Bool[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], np.ndarray]:
     """Distance to the silhouette's edge, positive inside, and (2, p, p) row and column of the nearest contour pixel.
 
     The edge runs half a pixel outside the contour pixels' centres.
@@ -149,7 +148,7 @@ def signed_distance_px(mask: Bool[Array, "p p"]) -> tuple[Float[Array, "p p"], A
     return np.where(mask, distance + 0.5, 0.5 - distance), nearest
 
 
-def _update(patch: Patch, pose: Float[Array, "4 4"], length_m: float) -> Float[Array, "6"]:
+def _update(patch: ObjectPatch, pose: Float[np.ndarray, "4 4"], length_m: float) -> Float[np.ndarray, "6"]:
     """A Gauss-Newton step on the summed negative log likelihood of the pixels around the silhouette.
 
     The patch's image holds posteriors, see `_as_image`.

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 from refinenet.baselines.kernels import mean_response
 from refinenet.image.edge_gradients import RENDER_EDGE, render_gradients
 
-Array = np.ndarray
 VIEWPOINTS = 642
 """8 degrees between neighbours."""
 POINTS = 160
@@ -41,18 +40,18 @@ class ViewpointModel:
         normals: (v, n, 3) unit vectors across the edge in the image, object frame.
     """
 
-    center_m: Float[Array, "3"]
+    center_m: Float[np.ndarray, "3"]
     viewpoints: cKDTree
-    points_m: Float[Array, "v n 3"]
-    normals: Float[Array, "v n 3"]
+    points_m: Float[np.ndarray, "v n 3"]
+    normals: Float[np.ndarray, "v n 3"]
 
     def similarity(
         self,
-        T_cam_obj: Float[Array, "b 4 4"],
-        K: Float[Array, "3 3"],
-        occluder_depth_m: Float[Array, "p p"],
-        responses: Float[Array, "o p p"],
-    ) -> Float[Array, " b"]:
+        T_cam_obj: Float[np.ndarray, "b 4 4"],
+        K: Float[np.ndarray, "3 3"],
+        occluder_depth_m: Float[np.ndarray, "p p"],
+        responses: Float[np.ndarray, "o p p"],
+    ) -> Float[np.ndarray, " b"]:
         """Mean response at the edge points of poses in front of the camera.
 
         Points outside the patch score 0. Points outside the image or behind a known occluder do not count, up to half
@@ -107,7 +106,7 @@ def make_viewpoint_model(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> Vie
     )
 
 
-def _ridge(direction: Float[Array, "p p 2"], strength: Float[Array, "p p"]) -> Bool[Array, "p p"]:
+def _ridge(direction: Float[np.ndarray, "p p 2"], strength: Float[np.ndarray, "p p"]) -> Bool[np.ndarray, "p p"]:
     """Edge pixels that are local maxima across the edge."""
     rows, columns = np.mgrid[: len(strength), : len(strength)].astype(np.float32)
     strength, x, y = (np.ascontiguousarray(v, np.float32) for v in (strength, direction[..., 0], direction[..., 1]))

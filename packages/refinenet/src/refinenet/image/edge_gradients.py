@@ -9,7 +9,6 @@ Source: the RGB verification of Kehl et al., SSD-6D, ICCV 2017, and the orientat
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-Array = np.ndarray
 RENDER_EDGE = 24.0
 """Smallest change of a channel over two pixels (0 to 255) that is an edge of the render."""
 SCENE_EDGE = 10.0
@@ -19,11 +18,11 @@ OUTLINE = 255.0
 
 
 def gradient_similarity(
-    scene_rgb: UInt8[Array, "b p p 3"],
-    hypothesis_rgb: UInt8[Array, "b p p 3"],
-    mask: Bool[Array, "b p p"],
-    inside: Bool[Array, "b p p"],
-) -> Float[Array, " b"]:
+    scene_rgb: UInt8[np.ndarray, "b p p 3"],
+    hypothesis_rgb: UInt8[np.ndarray, "b p p 3"],
+    mask: Bool[np.ndarray, "b p p"],
+    inside: Bool[np.ndarray, "b p p"],
+) -> Float[np.ndarray, " b"]:
     """Mean similarity of gradient orientations over the render's edges, in [0, 1]: 1 if equal, about 0 by chance.
 
     An edge pixel of the render, silhouette included, scores the cosine of twice the angle between both gradients where
@@ -48,14 +47,16 @@ def gradient_similarity(
 
 
 def render_gradients(
-    rgb: UInt8[Array, "b p p 3"], mask: Bool[Array, "b p p"]
-) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:
+    rgb: UInt8[np.ndarray, "b p p 3"], mask: Bool[np.ndarray, "b p p"]
+) -> tuple[Float[np.ndarray, "b p p 2"], Float[np.ndarray, "b p p"]]:
     """`orientation_gradients` of renders on black; silhouettes are edges whatever the object's colour."""
     outline = np.where(mask, np.float32(OUTLINE), np.float32(0))
     return orientation_gradients(np.concatenate([rgb.astype(np.float32), outline[..., None]], axis=-1))
 
 
-def orientation_gradients(values: Float[Array, "b p p c"]) -> tuple[Float[Array, "b p p 2"], Float[Array, "b p p"]]:
+def orientation_gradients(
+    values: Float[np.ndarray, "b p p c"],
+) -> tuple[Float[np.ndarray, "b p p 2"], Float[np.ndarray, "b p p"]]:
     """Unit direction (0 where flat) and strength of the gradient, at each pixel of the channel that changes most."""
     padded = np.pad(values, ((0, 0), (1, 1), (1, 1), (0, 0)), mode="edge")
     across = padded[:, :, 2:] - padded[:, :, :-2]

@@ -25,7 +25,6 @@ from refinenet.refine.input_checks import require_trained
 from refinenet.refine.patches import Patches, PatchRenderer
 from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, require_meshes
 
-Array = np.ndarray
 Scorer = Literal["gradient", "learned"]
 STOP_ANGLE_DEG = 1.5
 STOP_DISTANCE_M = 7.5e-3
@@ -37,13 +36,13 @@ log = logging.getLogger(__name__)
 class _Batch:
     """State of a batch during refinement; fields are changed in place."""
 
-    T: Float[Array, "b 4 4"]
-    obj_id: Int[Array, " b"]
-    converged: Bool[Array, " b"]
-    iterations: Int[Array, " b"]
+    T: Float[np.ndarray, "b 4 4"]
+    obj_id: Int[np.ndarray, " b"]
+    converged: Bool[np.ndarray, " b"]
+    iterations: Int[np.ndarray, " b"]
     failures: list[str | None]
 
-    def active(self) -> Int[Array, " a"]:
+    def active(self) -> Int[np.ndarray, " a"]:
         """Rows that neither failed nor converged."""
         return np.flatnonzero(np.array([reason is None for reason in self.failures], bool) & ~self.converged)
 
@@ -155,7 +154,11 @@ class Refiner:
         }
 
     def refine(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], obj_id: int
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        K: Float[np.ndarray, "3 3"],
+        T_cam_obj: Float[np.ndarray, "4 4"],
+        obj_id: int,
     ) -> Refinement:
         """Refine a pose; `refine_batch` refines many at once, which is faster.
 
@@ -205,7 +208,7 @@ class Refiner:
 
     def confidences(
         self, frame: Frame, requests: Sequence[Request], scorer: Scorer | None = None
-    ) -> Float[Array, " b"]:
+    ) -> Float[np.ndarray, " b"]:
         """Confidences of poses without refinement, in [0, 1]; 0 for a pose that is not visible.
 
         Args:
@@ -221,7 +224,7 @@ class Refiner:
         require_meshes(requests, self.meshes)
         return self._score(frame, _poses(requests), _objects(requests), scorer)[0]
 
-    def _update(self, frame: Frame, batch: _Batch, rows: Int[Array, " a"]) -> None:
+    def _update(self, frame: Frame, batch: _Batch, rows: Int[np.ndarray, " a"]) -> None:
         """Update these rows once."""
         patches = self.patch_renderer.render_and_crop(frame, batch.T[rows], batch.obj_id[rows])
         for row, reason in zip(rows, patches.failures, strict=True):
@@ -233,7 +236,9 @@ class Refiner:
         batch.iterations[visible] += 1
         batch.converged[visible] = small
 
-    def updated(self, patches: Patches, T: Float[Array, "s 4 4"]) -> tuple[Float[Array, "s 4 4"], Bool[Array, " s"]]:
+    def updated(
+        self, patches: Patches, T: Float[np.ndarray, "s 4 4"]
+    ) -> tuple[Float[np.ndarray, "s 4 4"], Bool[np.ndarray, " s"]]:
         """Updated poses, and a mask of the poses whose update was small."""
         update = self.predict(patches, T)
         # float32 products drift from orthonormal over many iterations, so each update is made a rotation again.
@@ -242,8 +247,8 @@ class Refiner:
         return se3.apply_update(T, dR, dt_m), small & (np.linalg.norm(dt_m, axis=-1) < STOP_DISTANCE_M)
 
     def _score(
-        self, frame: Frame, T: Float[Array, "b 4 4"], obj_id: Int[Array, " b"], scorer: Scorer | None
-    ) -> tuple[Float[Array, " b"], list[str | None]]:
+        self, frame: Frame, T: Float[np.ndarray, "b 4 4"], obj_id: Int[np.ndarray, " b"], scorer: Scorer | None
+    ) -> tuple[Float[np.ndarray, " b"], list[str | None]]:
         """Confidences of poses, and the reasons why some are not visible."""
         confidence, failures = np.zeros(len(T)), []
         for first in range(0, len(T), self._batch):
@@ -254,7 +259,9 @@ class Refiner:
                 confidence[part][patches.rows] = self._confidence(patches, T[part][patches.rows], scorer)
         return confidence, failures
 
-    def _confidence(self, patches: Patches, T: Float[Array, "s 4 4"], scorer: Scorer | None) -> Float[Array, " s"]:
+    def _confidence(
+        self, patches: Patches, T: Float[np.ndarray, "s 4 4"], scorer: Scorer | None
+    ) -> Float[np.ndarray, " s"]:
         if (scorer or self.scorer) == "learned":
             logit = self.predict(patches, T).confidence
             if logit is None:
@@ -264,7 +271,7 @@ class Refiner:
             return np.asarray(torch.sigmoid(logit.double()).cpu().numpy())
         return gradient_similarity(patches.scene_rgb, patches.hypothesis_rgb, patches.mask, patches.inside)
 
-    def predict(self, patches: Patches, T: Float[Array, "s 4 4"]) -> PoseUpdate:
+    def predict(self, patches: Patches, T: Float[np.ndarray, "s 4 4"]) -> PoseUpdate:
         """The network's update for these patches, in as many passes as the memory requires."""
         requested = self._batch
         while True:
@@ -289,7 +296,7 @@ class Refiner:
             torch.cat(confidences) if confidences else None,
         )
 
-    def _forward(self, patches: Patches, T: Float[Array, "s 4 4"], first: int) -> PoseUpdate:
+    def _forward(self, patches: Patches, T: Float[np.ndarray, "s 4 4"], first: int) -> PoseUpdate:
         part = slice(first, first + self._batch)
         pair = NetworkInput(
             scene_rgb=self._tensor(patches.scene_rgb[part].transpose(0, 3, 1, 2)),
@@ -302,19 +309,19 @@ class Refiner:
             update: PoseUpdate = self._network(pair)
         return update
 
-    def _tensor(self, values: Array) -> torch.Tensor:
+    def _tensor(self, values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
 
 
-def _poses(requests: Sequence[Request]) -> Float[Array, "b 4 4"]:
+def _poses(requests: Sequence[Request]) -> Float[np.ndarray, "b 4 4"]:
     return np.array([request.T_cam_obj for request in requests], np.float64).reshape(-1, 4, 4)
 
 
-def _objects(requests: Sequence[Request]) -> Int[Array, " b"]:
+def _objects(requests: Sequence[Request]) -> Int[np.ndarray, " b"]:
     return np.array([request.obj_id for request in requests], np.int64)
 
 
-def _blank(loaded: Checkpoint) -> tuple[Patches, Float[Array, "1 4 4"]]:
+def _blank(loaded: Checkpoint) -> tuple[Patches, Float[np.ndarray, "1 4 4"]]:
     """An empty patch and its pose: input to find out a network's outputs."""
     p = loaded.provenance.config.network.patch_px
     black = np.zeros((1, p, p, 3), np.uint8)

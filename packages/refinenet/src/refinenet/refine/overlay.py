@@ -15,7 +15,6 @@ from posecore.raster import Rasteriser
 from refinenet.refine.image_poses import ImagePoses, ImageResults
 from refinenet.refiner import Request
 
-Array = np.ndarray
 Colour = tuple[int, int, int]
 INITIAL_RGB: Colour = (230, 60, 40)
 REFINED_RGB: Colour = (60, 230, 90)
@@ -36,8 +35,8 @@ class Overlay:
         self._rasteriser.close()
 
     def draw(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], poses: Sequence[Request], rgb: Colour
-    ) -> UInt8[Array, "h w 3"]:
+        self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"], poses: Sequence[Request], rgb: Colour
+    ) -> UInt8[np.ndarray, "h w 3"]:
         """A copy of the image with the contours of all finite poses in one colour."""
         picture = image.copy()
         height_px, width_px = image.shape[:2]
@@ -79,7 +78,7 @@ class OverlayFolder:
         write_image(self._folder / f"{image.scene_id:06d}_{image.im_id:06d}.png", picture)
 
 
-def write_line(image: UInt8[Array, "h w 3"], text: str, rgb: Colour, line: int = 0) -> UInt8[Array, "h w 3"]:
+def write_line(image: UInt8[np.ndarray, "h w 3"], text: str, rgb: Colour, line: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """A copy of the image with a line of text at its top left, dark behind it; `line` counts downwards."""
     picture = image.copy()
     scale = max(0.4, image.shape[0] / 900)

@@ -13,8 +13,6 @@ from posecore.window import Window, cut_rgb, diameter_window, fixed_window, pixe
 from refinenet.models.checkpoint import Provenance
 from refinenet.refiner import Frame, render_obstacle
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Patches:
@@ -31,15 +29,15 @@ class Patches:
     """
 
     failures: list[str | None]
-    rows: Int[Array, " s"]
-    K_crop: Float[Array, "s 3 3"]
-    scene_rgb: UInt8[Array, "s p p 3"]
-    hypothesis_rgb: UInt8[Array, "s p p 3"]
-    depth_m: Float[Array, "s p p"]
-    inside: Bool[Array, "s p p"]
+    rows: Int[np.ndarray, " s"]
+    K_crop: Float[np.ndarray, "s 3 3"]
+    scene_rgb: UInt8[np.ndarray, "s p p 3"]
+    hypothesis_rgb: UInt8[np.ndarray, "s p p 3"]
+    depth_m: Float[np.ndarray, "s p p"]
+    inside: Bool[np.ndarray, "s p p"]
 
     @property
-    def mask(self) -> Bool[Array, "s p p"]:
+    def mask(self) -> Bool[np.ndarray, "s p p"]:
         """Silhouettes of the renders."""
         return self.depth_m > 0
 
@@ -70,7 +68,9 @@ class PatchRenderer:
         """Name of the rendering device."""
         return self._rasteriser.device
 
-    def render_and_crop(self, frame: Frame, T_cam_obj: Float[Array, "b 4 4"], obj_id: Int[Array, " b"]) -> Patches:
+    def render_and_crop(
+        self, frame: Frame, T_cam_obj: Float[np.ndarray, "b 4 4"], obj_id: Int[np.ndarray, " b"]
+    ) -> Patches:
         """Patches of poses in a frame; a pose without an object pixel inside the image has none."""
         p, b = self._patch_px, len(T_cam_obj)
         height_px, width_px = frame.image.shape[:2]
@@ -105,7 +105,7 @@ class PatchRenderer:
             inside=inside[visible],
         )
 
-    def _window(self, K: Float[Array, "3 3"], T: Float[Array, "4 4"], obj_id: int) -> Window:
+    def _window(self, K: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "4 4"], obj_id: int) -> Window:
         mesh, provenance = self._meshes[obj_id], self._provenance
         if provenance.config.window.kind == "diameter":
             return diameter_window(K, T, mesh.center_m, mesh.diameter_m, provenance.config.window.scale)
@@ -115,5 +115,5 @@ class PatchRenderer:
         return fixed_window(mesh.vertices_m, K, T, side_px * scale)
 
 
-def _stacked(patches: Sequence[UInt8[Array, "p p 3"]], patch_px: int) -> UInt8[Array, "s p p 3"]:
+def _stacked(patches: Sequence[UInt8[np.ndarray, "p p 3"]], patch_px: int) -> UInt8[np.ndarray, "s p p 3"]:
     return np.stack(patches) if patches else np.zeros((0, patch_px, patch_px, 3), np.uint8)

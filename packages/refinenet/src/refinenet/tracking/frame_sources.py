@@ -19,7 +19,6 @@ from posecore.errors import CameraError, ConfigError, DatasetError
 from refinenet.refine.image_poses import load_frame
 from refinenet.refiner import Frame, PoseRefiner
 
-Array = np.ndarray
 MIN_FRAME_FRACTION = 0.9
 """Least fraction of the frame count in a video's header that must decode; containers count inexactly."""
 
@@ -202,10 +201,10 @@ class FileCamera:
     """
 
     file: Path
-    K: Float[Array, "3 3"]
+    K: Float[np.ndarray, "3 3"]
     size_px: tuple[int, int] | None = None
 
-    def frame(self, image: UInt8[Array, "h w 3"], name: str) -> Frame:
+    def frame(self, image: UInt8[np.ndarray, "h w 3"], name: str) -> Frame:
         """An image from this camera as a frame.
 
         Raises:
@@ -240,5 +239,5 @@ def read_camera(file: Path) -> FileCamera:
         raise CameraError(f"{file}: found no numbers fx, fy, cx, cy ({error}); give a BOP camera.json") from error
 
 
-def _rgb(image: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
+def _rgb(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))

@@ -27,8 +27,6 @@ from refinenet.tracking.state import TrackingConfig, TrackState
 from refinenet.tracking.tracker import Tracked, Tracker, default_config
 from refinenet.tracking.video import VideoWriter, annotated
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJob:
@@ -197,7 +195,7 @@ def track_to_file(
 def track_sequence(
     sequence: FrameSequence,
     tracker: Tracker,
-    initial_poses: Callable[[int], Mapping[int, Sequence[Float[Array, "4 4"]]]],
+    initial_poses: Callable[[int], Mapping[int, Sequence[Float[np.ndarray, "4 4"]]]],
     log: TrackLog,
     *,
     meshes: Mapping[int, Mesh],

@@ -8,8 +8,6 @@ from jaxtyping import Float
 from posecore import se3
 from posecore.errors import ConfigError
 
-Array = np.ndarray
-
 
 class TrackState(StrEnum):
     """State of a track after a frame."""
@@ -90,10 +88,10 @@ class Observation:
     """An accepted pose and its frame number."""
 
     frame: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
 
 
-def predicted(before: Observation, last: Observation, frame: int) -> Float[Array, "4 4"]:
+def predicted(before: Observation, last: Observation, frame: int) -> Float[np.ndarray, "4 4"]:
     """Pose in a frame, extrapolated from two observations at constant velocity.
 
     The velocity is constant in camera axes about the object's origin, as pose updates are. The extrapolation is no
@@ -106,7 +104,7 @@ def predicted(before: Observation, last: Observation, frame: int) -> Float[Array
     )
 
 
-def at_depths(T_cam_obj: Float[Array, "4 4"], step: float) -> list[Float[Array, "4 4"]]:
+def at_depths(T_cam_obj: Float[np.ndarray, "4 4"], step: float) -> list[Float[np.ndarray, "4 4"]]:
     """A pose, then its copies shifted along the ray by a fraction of its depth, nearer and farther; none at step 0."""
     poses = []
     for factor in (1.0, 1.0 - step, 1.0 + step) if step else (1.0,):

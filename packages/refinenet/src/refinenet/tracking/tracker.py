@@ -22,7 +22,6 @@ from refinenet.tracking.state import (
     predicted,
 )
 
-Array = np.ndarray
 DEFAULT_CONFIGS: dict[ScoreKind, TrackingConfig] = {
     "learned": LEARNED_TRACKING,
     "gradients": GRADIENT_TRACKING,
@@ -51,7 +50,7 @@ class Tracked:
 
     obj_id: int
     state: TrackState
-    T_cam_obj: Float[Array, "4 4"] | None
+    T_cam_obj: Float[np.ndarray, "4 4"] | None
     confidence: float
     restarted: bool
     failure: str | None = None
@@ -78,7 +77,7 @@ class Track:
     _continued: int = 0
     """Hypotheses of the current frame that continue the track; those after are initial poses."""
 
-    def hypotheses(self, frame: int, initial: Sequence[Float[Array, "4 4"]]) -> list[Request]:
+    def hypotheses(self, frame: int, initial: Sequence[Float[np.ndarray, "4 4"]]) -> list[Request]:
         """Poses to refine in a frame.
 
         A lost track tries its last pose and the initial poses. Other tracks continue from the last pose, with the
@@ -180,7 +179,7 @@ class Tracker:
         ]
 
     def step(
-        self, number: int, frame: Frame, initial_poses: Mapping[int, Sequence[Float[Array, "4 4"]]] | None = None
+        self, number: int, frame: Frame, initial_poses: Mapping[int, Sequence[Float[np.ndarray, "4 4"]]] | None = None
     ) -> list[Tracked]:
         """Poses of all objects in the next frame.
 

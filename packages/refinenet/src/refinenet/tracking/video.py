@@ -13,12 +13,11 @@ from refinenet.refiner import Frame, Request
 from refinenet.tracking.state import TrackState
 from refinenet.tracking.tracker import Tracked
 
-Array = np.ndarray
 UNCERTAIN_RGB: Colour = (250, 200, 60)
 COLOURS = {TrackState.TRACKING: REFINED_RGB, TrackState.UNCERTAIN: UNCERTAIN_RGB, TrackState.LOST: INITIAL_RGB}
 
 
-def annotated(frame: Frame, number: int, tracked: Sequence[Tracked], overlay: Overlay) -> UInt8[Array, "h w 3"]:
+def annotated(frame: Frame, number: int, tracked: Sequence[Tracked], overlay: Overlay) -> UInt8[np.ndarray, "h w 3"]:
     """The frame with each object's contour in the colour of its state, and a line of text per object."""
     picture = frame.image
     for result in tracked:
@@ -50,7 +49,7 @@ class VideoWriter:
         if self._writer is not None:
             self._writer.release()
 
-    def write(self, image: UInt8[Array, "h w 3"]) -> None:
+    def write(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
         """Append a frame; all frames have the size of the first.
 
         Raises:
