@@ -144,7 +144,7 @@ class Mover(Given):
     predicts_pose_quality = True
 
 
-def test_a_network_that_tells_closeness_has_a_say_in_the_choice(tug, seen, monkeypatch):
+def test_predicted_pose_quality_counts_in_the_choice(tug, seen, monkeypatch):
     monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
     frame, truth, _, _ = seen
     request = Request(obj_id=1, T_cam_obj=far_start(truth, 0))

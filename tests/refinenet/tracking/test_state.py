@@ -16,7 +16,7 @@ from refinenet.tracking.state import (
     next_status,
     predicted,
 )
-from refinenet.tracking.tracker import Track, Tracker
+from refinenet.tracking.tracker import ObjectTrack, Tracker
 
 from ..conftest import K
 
@@ -186,7 +186,7 @@ def test_a_symmetric_object_keeps_its_spin_through_a_track():
 
 
 def test_each_depth_is_asked_for():
-    track = Track(obj_id=1, config=TrackingConfig(depth_step=0.03))
+    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03))
     assert len(track.hypotheses(0, [pose(8)])) == 1  # what is offered is taken as it is
     track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
     depths = [request.T_cam_obj[2, 3] / pose(8)[2, 3] for request in track.hypotheses(1, [])]
@@ -196,7 +196,7 @@ def test_each_depth_is_asked_for():
 def test_a_depth_is_left_only_for_one_that_is_clearly_better():
     nearer = pose(8, z=0.68)
     for confidence, z in ((0.61, 0.7), (0.63, 0.68)):
-        track = Track(obj_id=1, config=TrackingConfig())
+        track = ObjectTrack(obj_id=1, config=TrackingConfig())
         track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
         track.hypotheses(1, [])
         results = [(pose(8), 0.6), (nearer, confidence), (pose(8, z=0.72), 0.5)]
@@ -207,7 +207,7 @@ def test_a_depth_is_left_only_for_one_that_is_clearly_better():
 
 
 def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
-    track = Track(
+    track = ObjectTrack(
         obj_id=1, config=TrackingConfig(tracking_threshold=0.0, reacquire_threshold=0.0, patience=2, depth_step=0.0)
     )
     for frame, (status, state) in enumerate([(Status.STOPPED, T), (Status.FAILED, U), (Status.FAILED, L)]):

@@ -57,7 +57,7 @@ class Tracked:
 
 
 @dataclass(kw_only=True, eq=False)
-class Track:
+class ObjectTrack:
     """Track of an object: `hypotheses` gives the poses to refine in a frame, `update` takes the results.
 
     Attributes:
@@ -174,7 +174,7 @@ class Tracker:
         symmetric = symmetries or {}
         config = config or default_config(refiner)
         self._tracks = [
-            Track(obj_id=i, config=config, symmetries=symmetric.get(i), motion_model=motion_model)
+            ObjectTrack(obj_id=i, config=config, symmetries=symmetric.get(i), motion_model=motion_model)
             for i in sorted(set(obj_ids))
         ]
 
