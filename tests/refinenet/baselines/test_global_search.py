@@ -81,6 +81,7 @@ class Given:
     """Stands for a network: whatever it is asked, these poses are its answers, one after the other."""
 
     name, needs_depth, settings, predicts_pose_quality = "given", False, {"preset": "given"}, False
+    score_kind, corrects_depth = "learned", False
 
     def __init__(self, *poses):
         self.poses, self.asked, self.closed = poses, [], False
