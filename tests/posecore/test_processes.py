@@ -53,7 +53,7 @@ def test_nor_for_the_rest_of_a_result_that_is_being_sent(seconds):
     assert (ended.returncode, ended.stderr) == (3, "")
 
 
-def test_a_process_that_dies_is_said():
+def test_a_process_that_dies_is_reported():
     with pytest.raises(RenderError, match=r"^it died$"), spawned(1, behave_as_worker, (), "it died") as pool:
         pool.submit(os._exit, 1).result()
 

@@ -248,4 +248,4 @@ def test_manifest_lines_by_shard(tmp_path: Path) -> None:
     reader = shard.ShardReader(str(tmp_path / "d"))
     stored = [json.loads(line) for line in (tmp_path / "d" / shard.MANIFEST).read_text().splitlines()]
     assert list(reader.manifest_lines) == [0, 2]
-    assert list(reader.manifest_lines.values()) == stored[::-1]
+    assert list(reader.manifest_lines.values()) == sorted(stored, key=lambda line: line["shard"])

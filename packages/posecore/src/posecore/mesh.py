@@ -69,7 +69,7 @@ class Mesh:
 
     @cached_property
     def colours(self) -> UInt8[np.ndarray, "v 3"]:
-        """Vertex colours; sampled from the texture where there is one, mid grey where there is nothing."""
+        """Vertex colours; sampled from the texture where there is one, mid grey without either."""
         if self.vertex_rgb is not None:
             return self.vertex_rgb
         if self.uv is not None and self.texture_rgb is not None:
@@ -81,7 +81,7 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether the surface is closed and turned outwards, so that no back face is ever seen from outside.
+        """Whether the surface is closed and oriented outwards, so that no back face is visible from outside.
 
         Vertices at the same position count as one. Every directed edge must have its opposite, and every connected
         piece must enclose a positive volume.
@@ -241,7 +241,7 @@ def _appearance(
 
 
 def _refuse_missing_texture(file: Path) -> None:
-    """A material that names an image which is not there, or is none, is an error, never a silent grey."""
+    """Refuse a material whose image is missing or no image: it would silently become grey."""
     try:
         textures = _textures(file)
         missing = [texture for texture in textures if not texture.is_file()]

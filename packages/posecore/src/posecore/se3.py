@@ -114,7 +114,7 @@ def perturb(
 def stretched_along_ray(
     T_cam_obj: Float[np.ndarray, "4 4"], moved: Float[np.ndarray, "4 4"], factor: float
 ) -> Float[np.ndarray, "4 4"]:
-    """The moved pose with the part of its move along the ray from the camera to the object's origin times a factor."""
+    """`moved` with its translation along the ray from the camera to the object's origin multiplied by a factor."""
     ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
     along_m = (moved[:3, 3] - T_cam_obj[:3, 3]) @ ray
     return make_T(moved[:3, :3], moved[:3, 3] + (factor - 1) * along_m * ray)

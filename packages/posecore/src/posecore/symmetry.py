@@ -65,7 +65,7 @@ def _angles_rad(step_rad: float) -> Float[np.ndarray, " n"]:
 
 
 def is_ball(continuous: Sequence[ContinuousSymmetry]) -> bool:
-    """Whether the axes generate every rotation: any two are not parallel."""
+    """Whether the axes generate every rotation: they are not all parallel."""
     first = np.array(continuous[0].axis) if continuous else np.zeros(3)
     return any(np.linalg.norm(np.cross(first, other.axis)) > 1e-3 for other in continuous[1:])
 

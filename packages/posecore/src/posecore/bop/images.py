@@ -30,7 +30,7 @@ def find_image(folders: tuple[Path, ...], name: str, extensions: tuple[str, ...]
 
 
 def read_image(file: Path | StoredFile, flags: int) -> Shaped[np.ndarray, "h w *c"]:
-    """Decode an image file with OpenCV's flags, as it is stored (an EXIF turn is ignored); colours in OpenCV's order.
+    """Decode an image file with OpenCV's flags, as stored (EXIF orientation is ignored); colours in OpenCV's order.
 
     Raises:
         DatasetError: the file is missing, cut off, damaged, absurdly large or not an image.
@@ -57,7 +57,7 @@ def read_image(file: Path | StoredFile, flags: int) -> Shaped[np.ndarray, "h w *
 
 
 def _is_whole(data: bytes) -> bool:
-    """Whether a PNG or JPEG ends as it should.
+    """Whether a PNG or JPEG is complete.
 
     OpenCV fills the rest of a truncated JPEG with grey and prints libpng's warnings about a PNG. Pillow's `verify`
     accepts truncated JPEGs and takes 80 to 150 us more for each file.
@@ -133,7 +133,7 @@ def image_size(file: Path | StoredFile) -> tuple[int, int]:
 
 
 def _stated_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height as the start of a PNG or JPEG states them; None where it does not."""
+    """Width and height from the header of a PNG or JPEG; None if it has none."""
     if data.startswith(_PNG) and len(data) >= 33:
         width, height = struct.unpack(">II", data[16:24])
         is_intact = zlib.crc32(data[12:29]) == struct.unpack(">I", data[29:33])[0]

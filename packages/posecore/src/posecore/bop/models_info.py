@@ -64,7 +64,7 @@ def load_models_info(path: str | Path) -> dict[int, ModelInfo]:
 
 
 def load_model_info(entry: Any, where: str) -> ModelInfo:
-    """Read one object's entry of `models_info.json`, in metres.
+    """Read an object's entry of `models_info.json`, in metres.
 
     Raises:
         DatasetError: as `load_models_info`; the message starts with `where`.

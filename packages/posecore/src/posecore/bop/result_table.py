@@ -147,7 +147,7 @@ def _text(data: bytes, name: str, offset: int) -> str:
 
 
 def _header(body: bytes, name: str, offset: int) -> tuple[tuple[str, ...] | None, int, int]:
-    """Order of the columns if it is named, where the estimates start, and the line number there."""
+    """Order of the columns if it is named, and offset and line number of the first estimate."""
     start, line = 0, 1
     while True:  # up to the first line that is not blank; there is one
         end = body.find(b"\n", start)
@@ -182,7 +182,7 @@ def _chunks(body: bytes, start: int) -> Iterator[tuple[bytes, int]]:
 def _plain_numbers(
     chunk: bytes, order: tuple[str, ...]
 ) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 14"]] | None:
-    """Ids and numbers of lines that hold what they should, all at once; None where any may not."""
+    """Ids and numbers of well-formed lines, parsed at once; None if any line may be malformed."""
     plain = chunk.replace(b"\r\n", b"\n")
     if plain.translate(None, _PLAIN):
         return None

@@ -188,7 +188,7 @@ class BopWriter:
         return {im_id: tuple(json.dumps(content[im_id]) for content in contents) for im_id in complete}
 
     def _noted(self) -> dict[int, tuple[str, ...]]:
-        """The journal's frames; what follows its last whole line is cut off."""
+        """The journal's frames; a partial last line is truncated."""
         try:
             data = self._journal.read_bytes() if self._journal.is_file() else b""
             whole = data[: data.rfind(b"\n") + 1]

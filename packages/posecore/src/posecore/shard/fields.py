@@ -64,7 +64,7 @@ class Field:
         return np.dtype(np.float32) if self.squared or self.scale is not None else np.dtype(self.dtype)
 
     def encode(self, values: np.ndarray, card: Mapping[str, Any]) -> np.ndarray:
-        """Values in `unit` to what is stored; rounds to the nearest step and refuses what does not fit."""
+        """Quantise values in `unit`: rounds to the nearest step and refuses values out of range."""
         step = self.step(card)
         if self.squared:
             return self._square(values)
@@ -80,7 +80,7 @@ class Field:
         return np.asarray(stored.astype(self.dtype))
 
     def decode(self, stored: np.ndarray, card: Mapping[str, Any], out: np.ndarray) -> None:
-        """What is stored to values in `unit`, into an array of `decoded_dtype`."""
+        """Convert stored numbers to values in `unit`, into an array of `decoded_dtype`."""
         step = self.step(card)
         if self.squared:
             np.sqrt(stored, out=out, dtype=np.float32, casting="same_kind")

@@ -59,12 +59,12 @@ class ShardReader:
 
     @property
     def committed(self) -> list[int]:
-        """Ids of the shards that are there, sorted."""
+        """Ids of the committed shards, sorted."""
         return sorted(self._lines)
 
     @property
     def complete(self) -> bool:
-        """Whether every shard is there."""
+        """Whether every shard is committed."""
         return len(self._lines) == n_shards(self.card)
 
     @property

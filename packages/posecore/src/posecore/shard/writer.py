@@ -82,7 +82,7 @@ class ShardWriter:
         return sorted(line["shard"] for line in read_manifest(self.url, self._store))
 
     def quarantined(self) -> list[int]:
-        """Scenes that stand in for ones which crash the renderer, sorted."""
+        """Replacements of scenes that crash the renderer, sorted."""
         return sorted(scene for line in read_manifest(self.url, self._store) for scene in line.get("quarantined", ()))
 
     def damaged(self) -> dict[int, str]:
