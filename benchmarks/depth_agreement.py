@@ -14,8 +14,8 @@ import numpy as np
 from posecore.bop import BopDataset
 from posecore.errors import PoseError
 from posecore.raster import Rasteriser
-from refinenet.baselines.global_search import agreement_of
-from refinenet.baselines.patch import Target
+from refinenet.baselines.global_search import similarity_at
+from refinenet.baselines.patch import TrackedObject
 from refinenet.refiner import Frame
 
 STRETCH = np.arange(-10, 11) * 0.005
@@ -41,12 +41,12 @@ def main() -> None:
                 if not truth.has_pose or truth.visib_fract is None or truth.visib_fract < arguments.visible:
                     continue
                 mesh = meshes[truth.obj_id]
-                target = Target(obj_id=truth.obj_id, mesh=mesh, rasteriser=rasteriser)
+                target = TrackedObject(obj_id=truth.obj_id, mesh=mesh, rasteriser=rasteriser)
                 centre_m = truth.T_cam_obj[:3, :3] @ mesh.center_m + truth.T_cam_obj[:3, 3]
                 poses = [truth.T_cam_obj.copy() for _ in STRETCH]
                 for T_cam_obj, stretch in zip(poses, STRETCH, strict=True):
                     T_cam_obj[:3, 3] += np.expm1(stretch) * centre_m
-                curve = [agreement_of(frame, T_cam_obj, target) for T_cam_obj in poses]
+                curve = [similarity_at(frame, T_cam_obj, target) for T_cam_obj in poses]
                 curves.append(curve)
                 best_m.append(np.expm1(STRETCH[int(np.argmax(curve))]) * centre_m[2] / mesh.diameter_m)
     if not curves:

@@ -52,7 +52,7 @@ def measure(config: TrainConfig, run: Path, test: Path) -> dict[str, float]:
     )
     network = checkpoint.load(run / "last.safetensors").network()
     device = choose_device("cpu")
-    errors = validation.measure(network, validation_batches(source, split, config.batch), objects, device)
+    errors = validation.measure(network, validation_batches(source, split, config.batch), objects, device, config.loss)
     source.close()
     return {name.removeprefix("validation/"): round(value, 3) for name, value in errors.items()}
 
@@ -69,8 +69,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2500)
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
-    changes = ["hypothesis.fresh=false", f"steps={arguments.steps}", f"validation.every={arguments.steps}"]
-    changes += [f"threads={arguments.threads}", "validation.scene_share=0.02"]
+    changes = ["hypothesis.online=false", f"steps={arguments.steps}", f"validation.every={arguments.steps}"]
+    changes += [f"threads={arguments.threads}", "validation.scene_fraction=0.02"]
     config = load_config("compact", changes)
     results = []
     with tempfile.TemporaryDirectory() as folder:

@@ -81,17 +81,17 @@ def iteration_ms(refiner: Refiner, frame: Frame, requests: list[Request]) -> dic
     """Time of one iteration, of its two parts, and of a whole refinement."""
     T, obj_id = np.stack([r.T_cam_obj for r in requests]), np.array([r.obj_id for r in requests])
     began = time.perf_counter()
-    views = refiner.viewer.look(frame, T, obj_id)
-    looked = time.perf_counter()
-    refiner.moved(views, T[views.rows])
-    moved = time.perf_counter()
+    patches = refiner.patch_renderer.render_and_crop(frame, T, obj_id)
+    rendered = time.perf_counter()
+    refiner.updated(patches, T[patches.rows])
+    updated = time.perf_counter()
     refiner.refine_batch(frame, requests)
     end = time.perf_counter()
     return {
-        "iteration": 1e3 * (moved - began),
-        "render": 1e3 * (looked - began),
-        "network": 1e3 * (moved - looked),
-        "refine": 1e3 * (end - moved),
+        "iteration": 1e3 * (updated - began),
+        "render": 1e3 * (rendered - began),
+        "network": 1e3 * (updated - rendered),
+        "refine": 1e3 * (end - updated),
     }
 
 
@@ -104,7 +104,7 @@ def report(arguments: argparse.Namespace, refiner: Refiner, times_ms: dict[int, 
         "preset": refiner.checkpoint.provenance.config.preset,
         "device": torch.cuda.get_device_name() if refiner.device.type == "cuda" else "cpu",
         "torch_threads": torch.get_num_threads(),
-        "renderer": refiner.viewer.renderer,
+        "renderer": refiner.patch_renderer.device,
         "software_threads": os.environ.get("LP_NUM_THREADS", "all"),
         "cpus": os.cpu_count(),
         "load_average_1min": round(os.getloadavg()[0], 2),

@@ -17,11 +17,13 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import get_args
 
 import torch
-from refinenet.config import PRESETS, load_config
-from refinenet.data.pair_stream import Batch
+from refinenet.batch import Batch
+from refinenet.config import PresetName, load_config
 from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 from torch.utils.flop_counter import FlopCounterMode
 
 PEAK_TFLOPS = {"H100": 989.0, "H200": 989.0, "A100": 312.0}
@@ -32,7 +34,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("shards", help="dataset of `synthgen render`, folder or URL")
-    parser.add_argument("--preset", choices=PRESETS, default="compact")
+    parser.add_argument("--preset", choices=get_args(PresetName), default="compact")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--steps", type=int, default=20, help="steps of a block")
     parser.add_argument("--rounds", type=int, default=5, help="blocks of each kind")
@@ -44,7 +46,7 @@ def main() -> None:
     total = (2 * arguments.rounds + 2) * arguments.steps
     config = load_config(arguments.preset, [*arguments.overrides, f"steps={total}", "validation.pairs=16"])
     with tempfile.TemporaryDirectory() as folder:
-        run = Trainer(config, arguments.shards, Path(folder))
+        run = open_run(config, arguments.shards, Path(folder))
         batches = run.stream()
         kept = next(batches).to(run.device)
         step_flops = flops(run, kept)

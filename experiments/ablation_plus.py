@@ -43,8 +43,8 @@ OFF = {
     "point-loss": "loss.name=contour",
     "contour-loss": "loss.name=point",
     "in-plane": "hypothesis.in_plane=false",
-    "fresh": "hypothesis.fresh=false",
-    "own-predictions": "own_predictions.share=0",
+    "fresh": "hypothesis.online=false",
+    "own-predictions": "on_policy.fraction=0",
     "confidence": "network.confidence=false",
     "background": "augment.background=0",
     "occlusion": "augment.occlusion=0",
@@ -56,10 +56,7 @@ OFF = {
 }
 """Settings that turn each switch off."""
 
-ON = (
-    "network.confidence=true own_predictions.share=0.5 own_predictions.updates=2 augment.occlusion=0.3"
-    " optimiser.ema_decay=0.99"
-)
+ON = "network.confidence=true on_policy.fraction=0.5 on_policy.updates=2 augment.occlusion=0.3 optimiser.ema_decay=0.99"
 """Settings that turn on in `compact` what it leaves off."""
 
 BUDGET = {

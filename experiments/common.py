@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from posecore.bop import read_results
-from refinenet.refiner import BASELINES
+from refinenet.refine.registry import BASELINES
 
 from experiments.chain import ROOT, Step, quoted, run_all, say, seconds_of, shown, typed, words
 

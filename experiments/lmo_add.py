@@ -19,7 +19,7 @@ this file was chosen by a result on them. Start poses are the result file `init*
 import sys
 from pathlib import Path
 
-from refinenet.refiner import BASELINES
+from refinenet.refine.registry import BASELINES
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted

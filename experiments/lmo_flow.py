@@ -32,8 +32,8 @@ FRAMES = (
 )
 """Crowded, so that half of the objects are hidden in part."""
 STARTS = "--random-up-to 65 --random-translation 0.3 --depth-stretch 6"
-LOADER = "--threads 1 --set loader.cache_mb=6000 --set validation.scene_share=0.04"
-MISTAKES = "--set hypothesis.stored_share=0.5 --set loss.min_closeness=0.02 --set loader.shuffle_shards=32"
+LOADER = "--threads 1 --set loader.cache_mb=6000 --set validation.scene_fraction=0.04"
+MISTAKES = "--set hypothesis.precomputed_fraction=0.5 --set loss.min_pose_quality=0.02 --set loader.shuffle_shards=32"
 
 
 @dataclass(frozen=True, kw_only=True)

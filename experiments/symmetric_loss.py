@@ -37,7 +37,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     chosen = full_networks(inputs) if full else small_networks(TRAINING[size], losses)
     chosen = {name: chosen[name] for name in losses}
     if size == "small":
-        twins = small_networks(f"{TRAINING[size]} --set hypothesis.any_twin=true", losses)
+        twins = small_networks(f"{TRAINING[size]} --set hypothesis.sample_symmetries=true", losses)
         chosen |= {f"{name}-any-twin": network for name, network in twins.items()}
     return compared(
         work,

@@ -7,6 +7,7 @@ import pytest
 import torch
 from click.testing import CliRunner
 from posecore.shard import ShardReader
+from refinenet.batch import LossTarget
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.training import losses
@@ -28,11 +29,11 @@ def shard_arrays(tmp_path_factory, tug_ply: Path) -> dict[str, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def target(shard_arrays: dict[str, np.ndarray]) -> losses.Target:
+def target(shard_arrays: dict[str, np.ndarray]) -> LossTarget:
     def real(name: str) -> torch.Tensor:
         return torch.from_numpy(shard_arrays[name].astype(np.float64))
 
-    return losses.Target(
+    return LossTarget(
         T_cam_obj=real("T_cam_obj"),
         T_cam_obj_hypothesis=real("T_cam_obj_hypothesis"),
         K_crop=real("K_crop"),
@@ -44,7 +45,7 @@ def target(shard_arrays: dict[str, np.ndarray]) -> losses.Target:
     )
 
 
-def terms_px(update: PoseUpdate, target: losses.Target) -> tuple[torch.Tensor, torch.Tensor]:
+def terms_px(update: PoseUpdate, target: LossTarget) -> tuple[torch.Tensor, torch.Tensor]:
     """Both directions of the loss, (b,) each."""
     forward = losses.forward_contour_loss_px(update, target)
     return forward, losses.contour_loss_px(update, target) - forward
@@ -54,7 +55,7 @@ def no_update() -> PoseUpdate:
     return PoseUpdate(torch.eye(3, dtype=torch.float64).repeat(N, 1, 1), torch.zeros(N, 3, dtype=torch.float64))
 
 
-def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(target: losses.Target) -> None:
+def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(target: LossTarget) -> None:
     """A turned object shows another rim, so what stays grows with the angle; moved only, it is under half a pixel."""
     true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     start, end = terms_px(no_update(), target), terms_px(true, target)
@@ -66,7 +67,7 @@ def test_both_terms_vanish_at_the_true_update_up_to_the_contours_discretisation(
         assert float((after / before).median()) < 0.25
 
 
-def test_the_update_turns_about_the_objects_origin(target: losses.Target) -> None:
+def test_the_update_turns_about_the_objects_origin(target: LossTarget) -> None:
     """The same rotation about the camera's centre instead carries the contour far away."""
     true = poses.update_between(target.T_cam_obj_hypothesis, target.T_cam_obj)
     t = target.T_cam_obj_hypothesis[:, :3, 3]
@@ -75,7 +76,7 @@ def test_the_update_turns_about_the_objects_origin(target: losses.Target) -> Non
     assert float(wrong.median()) > 20 * float(right.median())
 
 
-def test_the_gradient_points_home(target: losses.Target) -> None:
+def test_the_gradient_points_home(target: LossTarget) -> None:
     """From the hypothesis, a small step along the negative gradient of either kind of motion brings the pose nearer.
 
     Moves: the translation's gradient lies within 90 degrees of the way home in the image plane wherever the start is

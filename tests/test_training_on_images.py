@@ -41,7 +41,7 @@ def work(tmp_path_factory, tug_ply: Path) -> Path:
 
 def test_a_network_learns_to_judge_from_a_searchs_candidates(work: Path) -> None:
     assert ShardReader(str(work / "cut")).n > 12
-    settings = ("hypothesis.stored_share=0.5", "loss.min_closeness=0.02", "batch=8", "loader.workers=0")
+    settings = ("hypothesis.precomputed_fraction=0.5", "loss.min_pose_quality=0.02", "batch=8", "loader.workers=0")
     network = ("network.patch_px=32", "network.match_radius=2", "network.encoder=[8, 8]", "network.widths=[8, 8]")
     arguments = [word for s in (*settings, *network) for word in ("--set", s)]
     run(
@@ -60,5 +60,5 @@ def test_windows_that_follow_the_distance_are_not_for_a_fixed_one(work: Path) ->
         arguments = ["train", str(work / shards), "--preset", "paper", *settings, "--out", str(work / "no")]
         result = CliRunner().invoke(refinenet, arguments)
         assert result.exit_code == 2, result.output
-        assert "windows are not of one side for all poses of an object" in result.stderr
+        assert "windows differ in side between poses of an object" in result.stderr
         assert "--set window=fixed" in result.stderr

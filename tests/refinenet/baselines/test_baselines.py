@@ -9,9 +9,10 @@ from posecore.errors import ConfigError, DatasetError
 from posecore.mesh import load_mesh
 from posecore.raster import DirectionalLight, Rasteriser, Shading
 from refinenet.baselines.base import refined
-from refinenet.baselines.gauss_newton import moved, projection_jacobian
+from refinenet.baselines.gauss_newton import apply_step, projection_jacobian
 from refinenet.baselines.region_tracker import signed_distance_px
-from refinenet.refiner import BASELINES, Frame, PoseRefiner, Request, Status, make_baseline
+from refinenet.refine.registry import BASELINES, MethodSettings, make_refiner
+from refinenet.refiner import Frame, PoseRefiner, Request, Status
 from scipy.spatial import cKDTree
 
 from ..conftest import HEIGHT_PX, WIDTH_PX, K, background
@@ -51,7 +52,7 @@ def distances(mesh, truth, pose, symmetric=False):
 def shares(name, ply, symmetric, angle_deg=7.0, distance=0.05, seeds=SEEDS):
     """Share of seeds that end at under half of the start's error, and the errors before and after."""
     mesh = load_mesh(ply)
-    refiner, before, after = make_baseline(name, {1: mesh}, 5), [], []
+    refiner, before, after = make_refiner(MethodSettings(method=name, iterations=5), {1: mesh}, None), [], []
     with Rasteriser({1: mesh}) as rasteriser:
         for seed in seeds:
             frame, truth = rendered_frame(mesh, rasteriser, seed)
@@ -98,7 +99,10 @@ def test_a_pose_far_from_its_start_has_diverged(tug):
     turned = se3.make_T(se3.rotation_from_rotvec(np.array([0, np.deg2rad(70), 0])), start[:3, 3])
     moved_off = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.8 * tug.diameter_m]))
     near = se3.make_T(np.eye(3), np.array([0, 0, 0.6 + 0.7 * tug.diameter_m]))
-    for pose, words in ((turned, "turned by 70 deg and moved by 0.0 d"), (moved_off, "by 0 deg and moved by 0.8 d")):
+    for pose, words in (
+        (turned, "rotated by 70 deg and translated by 0.0 d"),
+        (moved_off, "by 0 deg and translated by 0.8 d"),
+    ):
         result = refined(start, pose, pose, 9, tug.diameter_m)
         assert result.status is Status.FAILED
         assert words in result.failure
@@ -117,7 +121,7 @@ def test_a_symmetric_object_converges_to_one_of_its_poses(bobbin_ply, name):
 def test_a_pose_that_shows_nothing_fails_and_is_returned(tug, name, t_m):
     frame = Frame(image=np.full((480, 640, 3), 90, np.uint8), K=K, depth_m=np.ones((480, 640), np.float32))
     start = se3.make_T(np.eye(3), np.array(t_m, float))
-    refiner = make_baseline(name, {1: tug}, 5)
+    refiner = make_refiner(MethodSettings(method=name, iterations=5), {1: tug}, None)
     (result,) = refiner.refine_batch(frame, [Request(obj_id=1, T_cam_obj=start)])
     refiner.close()
     assert result.status is Status.FAILED
@@ -130,7 +134,7 @@ def test_an_image_without_evidence_fails(tug, name):
     """A plain grey image has no edges and one colour; its depth is all unknown."""
     frame = Frame(image=np.full((480, 640, 3), 90, np.uint8), K=K, depth_m=np.zeros((480, 640), np.float32))
     start = se3.make_T(se3.random_rotation(np.random.default_rng(0)), np.array([0, 0, 0.6]))
-    refiner = make_baseline(name, {1: tug}, 2)
+    refiner = make_refiner(MethodSettings(method=name, iterations=2), {1: tug}, None)
     (result,) = refiner.refine_batch(frame, [Request(obj_id=1, T_cam_obj=start)])
     refiner.close()
     assert result.status is Status.FAILED
@@ -138,7 +142,7 @@ def test_an_image_without_evidence_fails(tug, name):
 
 
 def test_depth_is_asked_for_in_one_line(tug):
-    refiner = make_baseline("depth-icp", {1: tug}, 2)
+    refiner = make_refiner(MethodSettings(method="depth-icp", iterations=2), {1: tug}, None)
     assert isinstance(refiner, PoseRefiner)
     assert refiner.needs_depth
     frame = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
@@ -153,7 +157,7 @@ def test_projections_move_as_the_jacobian_says():
     pose = se3.make_T(se3.random_rotation(rng), np.array([0.05, -0.03, 0.7]))
     J = projection_jacobian(K, se3.apply(pose, points), pose[:3, 3], length_m)
     for k, small in enumerate(1e-6 * np.eye(6)):
-        ahead, behind = (project(K, se3.apply(moved(pose, sign * small, length_m), points)) for sign in (1, -1))
+        ahead, behind = (project(K, se3.apply(apply_step(pose, sign * small, length_m), points)) for sign in (1, -1))
         np.testing.assert_allclose((ahead - behind) / 2e-6, J[..., k], rtol=1e-5, atol=1e-4)
 
 
@@ -180,7 +184,7 @@ def test_what_is_no_pose_fails_with_the_reason(name, mesh, frame):
         "it is behind the camera or reaches it": [behind],
         "its pose is not finite": [lost],
     }
-    method = make_baseline(name, {1: mesh}, 2)
+    method = make_refiner(MethodSettings(method=name, iterations=2), {1: mesh}, None)
     for why, poses in reasons.items():
         for pose in poses:
             (found,) = method.refine_batch(

@@ -39,10 +39,10 @@ def test_train_command(cli, dataset, tmp_path):
 
 def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
     """One more option at the end of a command turns a switch off; and pools of a fixed network read their ranges."""
-    on = ["own_predictions.share=0.5", "own_predictions.updates=2", "network.confidence=true"]
-    off = ["own_predictions.share=0", "network.confidence=false", "loss.confidence_weight=2"]
-    assert load_config("compact", [*on, *off]).own_predictions.updates == 2
-    assert not load_config("compact", ["hypothesis.in_plane=false", "hypothesis.fresh=false"]).hypothesis.fresh
+    on = ["on_policy.fraction=0.5", "on_policy.updates=2", "network.confidence=true"]
+    off = ["on_policy.fraction=0", "network.confidence=false", "loss.confidence_weight=2"]
+    assert load_config("compact", [*on, *off]).on_policy.updates == 2
+    assert not load_config("compact", ["hypothesis.in_plane=false", "hypothesis.online=false"]).hypothesis.online
     assert load_config("paper", ["hypothesis.max_angle_deg=40"]).hypothesis.max_angle_deg == 40
 
 
@@ -51,21 +51,28 @@ def test_a_switch_that_is_turned_off_by_hand_takes_its_settings_along():
     [
         (["--set", "optimiser.momentum=1"], 2, "unknown key optimiser.momentum"),
         (["--set", "optimiser.lr=fast"], 2, "optimiser.lr is 'fast', expected float"),
-        (["--set", "hypothesis.fresh=false", "--set", "hypothesis.stored_share=0.5"], 2, "set hypothesis.fresh=true"),
-        (["--set", "loss.min_closeness=0.1"], 2, "which this network has not: set network.confidence=true"),
+        (
+            ["--set", "hypothesis.online=false", "--set", "hypothesis.precomputed_fraction=0.5"],
+            2,
+            "set hypothesis.online=true",
+        ),
+        (["--set", "own_predictions.share=0.5"], 2, "own_predictions.share was renamed; write on_policy.fraction"),
+        (["--set", "hypothesis={fresh: true}"], 2, "hypothesis.fresh was renamed; write hypothesis.online"),
+        (["--set", "loss.confidence_target=closeness"], 2, "write loss.confidence_target=pose_quality"),
+        (["--set", "loss.min_pose_quality=0.1"], 2, "this network has no confidence: set network.confidence=true"),
         (["--preset", "paper", "--set", "backbone.pretrained=false"], 2, "patches of 64 px, preset paper expects 224"),
         (
             ["--preset", "paper", "--set", "hypothesis.in_plane=true"],
             2,
-            "hypothesis.in_plane changes nothing here: it needs hypothesis.fresh=true",
+            "hypothesis.in_plane changes nothing here: it needs hypothesis.online=true",
         ),
         (["--backbone-weights", "stem.safetensors"], 2, "network.backbone.weights changes nothing here"),
-        (["--set", "own_predictions.updates=2"], 2, "it needs own_predictions.share=0.5 or so"),
+        (["--set", "on_policy.updates=2"], 2, "it needs on_policy.fraction=0.5 or so"),
         (["--preset", "paper", "--set", "network.widths=[8, 8]"], 2, "it needs network.kind=compact, plus or flow"),
         (["--preset", "flow", "--set", "network.hidden=8"], 2, "it needs network.kind=compact or plus"),
         (["--set", "optimiser.name=adam", "--set", "optimiser.weight_decay=1"], 2, "it needs optimiser.name=adamw"),
-        (["--set", "augment.occlusion_leaves=0.2"], 2, "it needs augment.occlusion=0.3 or so"),
-        (["--set", "own_predictions={updates: 2}"], 2, "own_predictions.updates changes nothing here"),
+        (["--set", "augment.min_visible_fraction=0.2"], 2, "it needs augment.occlusion=0.3 or so"),
+        (["--set", "on_policy={updates: 2}"], 2, "on_policy.updates changes nothing here"),
         (["--loss", "contour", "--set", "loss.point_weight=2"], 2, "it needs loss.name=contour+point"),
         (["--set", "optimiser.lr=-1"], 2, "lr is -1"),
         (["--set", "optimiser.lr=.inf"], 2, "lr is inf"),
@@ -99,7 +106,7 @@ def test_a_damaged_shard_is_one_line_also_from_a_loader_process(cli, dataset, tm
     damaged = next(shard for shard in range(6) if shard not in validation.rows)
     file = copy / f"scene_rgb/c/{damaged}/0/0/0"
     file.write_bytes(file.read_bytes()[:-100])
-    options = ["--workers", workers, "--set", "validation.scene_share=0.05", "--set", "loader.shuffle_shards=6"]
+    options = ["--workers", workers, "--set", "validation.scene_fraction=0.05", "--set", "loader.shuffle_shards=6"]
     result = cli("train", copy, "--out", tmp_path / "run", *SMALL, *options, "--quiet")
     assert result.exit_code == 1
     (line,) = result.stderr.splitlines()

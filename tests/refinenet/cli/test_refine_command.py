@@ -78,7 +78,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     ]
     result = cli("refine", *arguments, "--name", "mine", "--iterations", 2)
     assert result.exit_code == 0, result.output
-    assert "3 start poses, 2 refined (0 converged), 1 failed (left out of the file)" in result.stdout
+    assert "3 initial poses, 2 refined (0 converged), 1 failed (left out of the file)" in result.stdout
     refined, starts = read_results(out, BopDataset(root)), read_results(start)
     assert all(0 < e.score < 1 and e.score != 0.9 for e in refined)  # how well the pose fits
     assert np.abs(refined[0].T_cam_obj - starts[0].T_cam_obj).max() > 1e-4
@@ -95,7 +95,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     picture = cv2.imread(str(tmp_path / "pics" / "000001_000000.png"))
     assert picture.shape == (HEIGHT_PX, WIDTH_PX, 3)
     result = cli("refine", *arguments[:-2], "--iterations", 1, "--keep-failed")
-    assert "1 failed (start poses kept)" in result.stdout
+    assert "1 failed (initial poses kept)" in result.stdout
     kept, sidecar = read_results(out), read_sidecar(out)
     assert sidecar["settings"]["min_confidence"] == 0
     assert (len(kept), sidecar["initial_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
@@ -129,7 +129,7 @@ def test_what_was_finished_is_written_when_something_ends_it(cli, two_images, tr
     ]
     result = cli("refine", *rest)
     assert result.exit_code == 1
-    assert f"Stopped: 1 start poses were not reached, {out} holds the others" in result.stderr
+    assert f"Stopped: 1 initial poses were not reached, {out} holds the others" in result.stderr
     assert "000001" in result.stderr.splitlines()[-1]
     assert result.stderr.splitlines()[-1].startswith("Error: ")
     assert (len(read_results(out)), read_sidecar(out)["not_reached"]) == (2, 1)

@@ -10,11 +10,18 @@ from posecore.bop.models_info import save_models_info
 from posecore.errors import ConfigError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
-from refinenet.data.growing_split import Growth, wait_for_start
-from refinenet.data.split import OTHER_OBJECT, DataRecord, divide, drawn_out, held_out_scenes, read_scenes
+from refinenet.data.growing_split import GrowingSplit, wait_for_start
+from refinenet.data.split import (
+    OTHER_OBJECT,
+    DataRecord,
+    choose_validation_scenes,
+    divide,
+    draw_validation_scenes,
+    read_scenes,
+)
 from refinenet.models.checkpoint import load
 from refinenet.training.loop import train
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 
 from ..training.test_training import small
 
@@ -42,19 +49,19 @@ def test_only_the_chosen_objects_scenes_are_split(two_objects):
     scene_of, _ = read_scenes(reader, reader.committed, objects=(2,))
     flat = np.concatenate(list(scene_of.values()))
     assert set(flat) == {OTHER_OBJECT, *range(1, 24, 2)}
-    held_out = held_out_scenes(reader.url, scene_of, 0.25, 0)
-    assert len(held_out) == 3 and (held_out % 2 == 1).all()
-    training, validation = divide(scene_of, held_out)
+    scenes = choose_validation_scenes(reader.url, scene_of, 0.25, 0)
+    assert len(scenes) == 3 and (scenes % 2 == 1).all()
+    training, validation = divide(scene_of, scenes)
     assert (training.scenes, validation.scenes) == (9, 3)
     assert (training.n, validation.n) == (18, 6)
 
 
 def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     config = small("objects=[2]", "batch=4", "steps=3", "loader.workers=0")
-    run = Trainer(config, str(two_objects), tmp_path / "look")
+    run = open_run(config, str(two_objects), tmp_path / "look")
     for batch in itertools.islice(run.stream(), 12):
         assert (batch.target.object_index == 1).all()
-    assert all((batch.target.object_index == 1).all() for batch in run._held_out.batches)
+    assert all((batch.target.object_index == 1).all() for batch in run.data.validation.batches)
     run.close()
     train(config, str(two_objects), tmp_path / "run")
     assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
@@ -63,12 +70,12 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
 def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
     config = small("objects=[1]", "batch=4", "steps=8", "loader.follow=true", "loader.workers=0")
     train(config, str(two_objects), tmp_path / "run")
-    held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
-    assert all(scene % 2 == 0 for scene in held_out)
+    scenes = json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"]
+    assert all(scene % 2 == 0 for scene in scenes)
     # A run that began with two shards: the others join in its second epoch.
     (tmp_path / "grown").mkdir()
-    record = DataRecord(shards=(0, 1), held_out=(0,))
-    growth = Growth(out=tmp_path / "grown", record=record, config=config)
+    record = DataRecord(shards=(0, 1), validation_scenes=(0,))
+    growth = GrowingSplit(out=tmp_path / "grown", record=record, config=config)
     joined = next(growth.epochs(str(two_objects)))
     reader = ShardReader(str(two_objects))
     assert set(joined) == {*reader.committed} - {0, 1}
@@ -82,7 +89,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
     copy = shutil.copytree(two_objects, tmp_path / "growing")
     lines = (copy / "manifest.jsonl").read_text().splitlines(keepends=True)
     (copy / "manifest.jsonl").write_text("".join(lines[:2]))
-    assert drawn_out(np.arange(8), 0.1, 2).tolist() == [6]
+    assert draw_validation_scenes(np.arange(8), 0.1, 2).tolist() == [6]
     reader = ShardReader(str(copy))
 
     class Waited(Exception):
@@ -92,7 +99,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
         raise Waited
 
     monkeypatch.setattr("refinenet.data.growing_split.time.sleep", wait)
-    options = ["loader.follow=true", "seed=2", "validation.scene_share=0.1"]
+    options = ["loader.follow=true", "seed=2", "validation.scene_fraction=0.1"]
     wait_for_start(reader, small(*options, "objects=[1]"), 1)
     with pytest.raises(Waited):
         wait_for_start(reader, small(*options, "objects=[2]"), 1)
@@ -100,7 +107,7 @@ def test_a_growing_dataset_is_waited_for_by_the_chosen_objects_scenes(two_object
 
 def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):
     with pytest.raises(ConfigError, match="there is no object 7 in it, only 1, 2"):
-        Trainer(small("objects=[1, 7]"), str(two_objects), tmp_path / "run")
+        open_run(small("objects=[1, 7]"), str(two_objects), tmp_path / "run")
     result = cli("train", two_objects, "--object", 7, "--out", tmp_path / "run", "--quiet")
     assert result.exit_code == 2
     assert "there is no object 7" in result.stderr

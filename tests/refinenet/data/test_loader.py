@@ -19,7 +19,7 @@ from .test_pair_stream import make_stream, split_by_scene
 
 def test_batches_that_shared_memory_cannot_hold_are_refused(dataset, monkeypatch):
     batch = next(iter(make_stream(dataset, split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0])))
-    held = sum(x.nbytes for x in (*batch.pair, *batch.target) if x is not None)
+    held = sum(x.nbytes for x in (*batch.inputs, *batch.target) if x is not None)
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(4.5 * held, 0, 0))
     loader.require_shared_memory(batch, 4)

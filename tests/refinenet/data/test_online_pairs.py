@@ -6,10 +6,10 @@ from posecore.raster import Rasteriser
 from posecore.shard import ShardReader
 from posecore.window import Window, cut
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig, load_config
-from refinenet.data.online_pairs import PairMaker, draw_hypothesis
+from refinenet.data.online_pairs import OnlinePairMaker, draw_hypothesis
 from refinenet.image import augmentation
-from refinenet.image.crops import optical_axis_turn, recut_affine, warp
-from refinenet.image.masks import visible_overlap, visible_share
+from refinenet.image.crops import crop_affine, optical_axis_rotation, warp
+from refinenet.image.masks import visible_fraction, visible_mask_iou
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def rasteriser(mesh):
 
 
 def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, symmetries=None, **hypothesis):
-    maker = PairMaker(
+    maker = OnlinePairMaker(
         meshes={1: mesh},
         rasteriser=rasteriser,
         patch_px=64,
@@ -41,7 +41,7 @@ def make_pairs(mesh, rasteriser, samples, seed=0, augment_config=None, symmetrie
 def test_hypotheses_start_at_any_pose_that_looks_like_the_truth(mesh, rasteriser, samples):
     half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
     symmetries = {1: np.stack([np.eye(4), half_turn])}
-    drawn = {"fresh": True, "max_angle_deg": 10.0, "symmetries": symmetries}
+    drawn = {"online": True, "max_angle_deg": 10.0, "symmetries": symmetries}
 
     def turned_deg(**more):
         pairs = [make_pairs(mesh, rasteriser, samples, seed, **drawn, **more) for seed in range(4)]
@@ -49,9 +49,9 @@ def test_hypotheses_start_at_any_pose_that_looks_like_the_truth(mesh, rasteriser
         return np.rad2deg(se3.rotation_angle_rad(np.concatenate(changes)))
 
     assert turned_deg().max() < 10.1
-    far = turned_deg(any_twin=True) > 165
+    far = turned_deg(sample_symmetries=True) > 165
     assert 0.2 < far.mean() < 0.8
-    assert (turned_deg(any_twin=True)[~far] < 10.1).all()
+    assert (turned_deg(sample_symmetries=True)[~far] < 10.1).all()
 
 
 def test_recut_without_a_turn_is_the_cut_itself():
@@ -60,7 +60,7 @@ def test_recut_without_a_turn_is_the_cut_itself():
     K = np.array([[400.0, 0, 150], [0, 410, 100], [0, 0, 1]])
     whole = Window(x0_px=50, y0_px=20, side_px=128)
     part = Window(x0_px=70, y0_px=44, side_px=64)
-    affine = recut_affine(whole, 128, K, np.eye(3), part, 64)
+    affine = crop_affine(whole, 128, K, np.eye(3), part, 64)
     np.testing.assert_array_equal(warp(cut(image, whole, 128), affine, 64), cut(image, part, 64))
 
 
@@ -76,7 +76,7 @@ def test_colours_at_the_edge_of_a_stored_patch_stay_as_they_are():
 @pytest.mark.parametrize("in_plane", [False, True])
 def test_turned_and_recut_scenes_show_the_object_at_its_new_truth(mesh, rasteriser, samples, in_plane):
     """The stored silhouette, turned and cut anew, is the silhouette rendered at the new pose with the new camera."""
-    pairs = make_pairs(mesh, rasteriser, samples, fresh=True, in_plane=in_plane)
+    pairs = make_pairs(mesh, rasteriser, samples, online=True, in_plane=in_plane)
     truth = rasteriser.render(1, pairs.K_crop, pairs.T_cam_obj, 64, 64).mask
     overlaps = []
     for k, i in enumerate(pairs.kept):
@@ -92,7 +92,7 @@ def test_turned_and_recut_scenes_show_the_object_at_its_new_truth(mesh, rasteris
 
 
 def test_hypotheses_are_drawn_within_the_range(mesh):
-    config = HypothesisConfig(fresh=True, max_angle_deg=20, max_translation_diameter=0.2, easy_share=0.0)
+    config = HypothesisConfig(online=True, max_angle_deg=20, max_translation_diameter=0.2, easy_fraction=0.0)
     rng = np.random.default_rng(0)
     T = se3.make_T(np.eye(3), np.array([0, 0, 1.0]))
     drawn = np.stack([draw_hypothesis(T, mesh.diameter_m, config, rng) for _ in range(300)])
@@ -117,8 +117,8 @@ def test_the_depth_stretch_scales_the_move_along_the_viewing_ray_alone(mesh):
         np.testing.assert_allclose(np.cross(stretched_move, ray), np.cross(move, ray), atol=1e-12)
 
 
-def test_stored_hypotheses_are_kept_without_fresh_ones(mesh, rasteriser, samples):
-    pairs = make_pairs(mesh, rasteriser, samples, fresh=False)
+def test_precomputed_hypotheses_are_taken_without_online_ones(mesh, rasteriser, samples):
+    pairs = make_pairs(mesh, rasteriser, samples, online=False)
     for k, i in enumerate(pairs.kept):
         np.testing.assert_allclose(pairs.T_cam_obj_hypothesis[k], samples[i]["T_cam_obj_hypothesis"])
 
@@ -128,7 +128,7 @@ def test_some_hypotheses_are_the_stored_ones(mesh, rasteriser, samples, share, l
     """Turned with their scenes; each belongs to its own truth all the same."""
     stored = 0
     for seed in range(4):
-        pairs = make_pairs(mesh, rasteriser, samples, seed, fresh=True, max_angle_deg=1.0, stored_share=share)
+        pairs = make_pairs(mesh, rasteriser, samples, seed, online=True, max_angle_deg=1.0, precomputed_fraction=share)
         for k, i in enumerate(pairs.kept):
             relative, given = (
                 se3.update_between(a, b)
@@ -144,8 +144,8 @@ def test_some_hypotheses_are_the_stored_ones(mesh, rasteriser, samples, share, l
 
 def test_the_same_generators_make_the_same_pairs(mesh, rasteriser, samples):
     config = load_config("compact").augment
-    first, again = (make_pairs(mesh, rasteriser, samples, 3, config, fresh=True) for _ in range(2))
-    other = make_pairs(mesh, rasteriser, samples, 4, config, fresh=True)
+    first, again = (make_pairs(mesh, rasteriser, samples, 3, config, online=True) for _ in range(2))
+    other = make_pairs(mesh, rasteriser, samples, 4, config, online=True)
     for name, value in vars(first).items():
         np.testing.assert_array_equal(value, getattr(again, name))
     assert (first.scene_rgb != other.scene_rgb).any()
@@ -153,24 +153,24 @@ def test_the_same_generators_make_the_same_pairs(mesh, rasteriser, samples):
 
 def test_a_scene_without_its_object_is_replaced_by_another(mesh, rasteriser, samples):
     empty = {**samples[0], "scene_mask": np.zeros_like(samples[0]["scene_mask"])}
-    pairs = make_pairs(mesh, rasteriser, [empty, *samples[1:]], fresh=True)
+    pairs = make_pairs(mesh, rasteriser, [empty, *samples[1:]], online=True)
     assert len(pairs.kept) == 8
     assert 0 not in pairs.kept
-    assert make_pairs(mesh, rasteriser, [empty], fresh=True) is None
+    assert make_pairs(mesh, rasteriser, [empty], online=True) is None
 
 
 def test_no_black_corner_shows_where_the_stored_window_ended(mesh, rasteriser, samples):
     """A stored patch of white: wherever the new patch is black, the stored window's edge could be seen."""
     white = [{**s, "scene_rgb": np.full_like(s["scene_rgb"], 255)} for s in samples]
     white = [{**s, "window_px": s["window_px"] * [1, 1, 0.6]} for s in white]  # a window that ends inside the new one
-    pairs = make_pairs(mesh, rasteriser, white, fresh=True)
+    pairs = make_pairs(mesh, rasteriser, white, online=True)
     assert (pairs.scene_rgb.max(axis=-1) > 0).mean() > 0.99
 
 
 def test_background_exchange_keeps_the_object(mesh, rasteriser, samples):
     """The object's pixels stay, the rest changes."""
-    kept = make_pairs(mesh, rasteriser, samples, fresh=True)
-    exchanged = make_pairs(mesh, rasteriser, samples, fresh=True, augment_config=AugmentConfig(background=1.0))
+    kept = make_pairs(mesh, rasteriser, samples, online=True)
+    exchanged = make_pairs(mesh, rasteriser, samples, online=True, augment_config=AugmentConfig(background=1.0))
     truth = rasteriser.render(1, kept.K_crop, kept.T_cam_obj, 64, 64).mask
     inner = np.stack([contour.distance_transform_px(~m) > 2 if m.any() else m for m in truth])
     same = (kept.scene_rgb == exchanged.scene_rgb).all(axis=-1)
@@ -180,12 +180,12 @@ def test_background_exchange_keeps_the_object(mesh, rasteriser, samples):
 
 def test_occluders_hide_part_of_the_object_and_nothing_else(mesh, rasteriser, samples):
     """The visible share falls, never under its limit; pixels and masks change together; truth and contour stay."""
-    plain = make_pairs(mesh, rasteriser, samples, fresh=True)
-    config = AugmentConfig(occlusion=1.0, occlusion_leaves=0.4)
-    covered = make_pairs(mesh, rasteriser, samples, fresh=True, augment_config=config)
-    assert (plain.visible_share == 1).all()
-    assert (covered.visible_share >= 0.4).all()
-    assert (covered.visible_share < 0.98).sum() >= 4
+    plain = make_pairs(mesh, rasteriser, samples, online=True)
+    config = AugmentConfig(occlusion=1.0, min_visible_fraction=0.4)
+    covered = make_pairs(mesh, rasteriser, samples, online=True, augment_config=config)
+    assert (plain.visible_fraction == 1).all()
+    assert (covered.visible_fraction >= 0.4).all()
+    assert (covered.visible_fraction < 0.98).sum() >= 4
     changed = (plain.scene_rgb != covered.scene_rgb).any(axis=-1)
     over = (covered.scene_bits & 4 > 0) & (covered.scene_bits & 2 == 0)
     assert not (changed & ~over).any()
@@ -194,9 +194,9 @@ def test_occluders_hide_part_of_the_object_and_nothing_else(mesh, rasteriser, sa
 
 
 def test_fixed_windows_keep_their_side_in_the_image(mesh, rasteriser, samples):
-    maker = PairMaker(
+    maker = OnlinePairMaker(
         meshes={1: mesh}, rasteriser=rasteriser, patch_px=64, window=WindowConfig(kind="fixed"), contour_points=32,
-        hypothesis=HypothesisConfig(fresh=True), augment_config=AugmentConfig(), fixed_sides_px={1: 188.0},
+        hypothesis=HypothesisConfig(online=True), augment_config=AugmentConfig(), fixed_sides_px={1: 188.0},
     )  # fmt: skip
     pairs = maker(samples, [np.random.default_rng([0, i]) for i in range(len(samples))])
     np.testing.assert_allclose(pairs.K_crop[:, 0, 0], samples[0]["K"][0, 0] * 64 / 188)
@@ -208,16 +208,16 @@ def test_overlap_is_one_at_the_truth_whatever_covers_it_and_zero_apart():
     bits[2:6, 2:6] = 1 | 2 | 4
     truth = bits > 0
     apart = np.roll(truth, 4, axis=1) & ~truth
-    assert visible_overlap(truth, bits) == 1
+    assert visible_mask_iou(truth, bits) == 1
     for background in (np.uint8(0), np.uint8(4)):  # a wall is foreground too, and hides nothing
-        assert visible_overlap(np.roll(truth, 2, axis=0), bits | background) == pytest.approx(8 / 24)
+        assert visible_mask_iou(np.roll(truth, 2, axis=0), bits | background) == pytest.approx(8 / 24)
     bits[2:6, 2:4] = 1 | 4
-    assert visible_share(bits) == 0.5
-    assert visible_overlap(truth, bits) == 1
-    assert visible_overlap(apart, bits) == 0
+    assert visible_fraction(bits) == 0.5
+    assert visible_mask_iou(truth, bits) == 1
+    assert visible_mask_iou(apart, bits) == 0
     bits[2:6, 2:6] = 1 | 4
-    assert visible_overlap(truth, bits) == 0
-    assert visible_share(np.zeros((3, 8, 8), np.uint8)).tolist() == [0, 0, 0]
+    assert visible_mask_iou(truth, bits) == 0
+    assert visible_fraction(np.zeros((3, 8, 8), np.uint8)).tolist() == [0, 0, 0]
 
 
 def test_colour_augmentation_keeps_black_and_moves_both_patches_together():
@@ -235,15 +235,15 @@ def test_colour_augmentation_keeps_black_and_moves_both_patches_together():
     np.testing.assert_array_equal(same[0], hypothesis)
 
 
-def test_the_optical_axis_turn_keeps_depth():
-    R = optical_axis_turn(0.7)
+def test_the_optical_axis_rotation_keeps_depth():
+    R = optical_axis_rotation(0.7)
     assert se3.is_rotation(R)
     np.testing.assert_array_equal(R[2], [0, 0, 1])
 
 
 def test_crop_camera_is_that_of_the_window(mesh, rasteriser, samples):
-    """The window of every fresh hypothesis is the one that inference cuts: centred on it, 1.5 diameters wide."""
-    pairs = make_pairs(mesh, rasteriser, samples, fresh=True)
+    """The window of every online hypothesis is the one that inference cuts: centred on it, 1.5 diameters wide."""
+    pairs = make_pairs(mesh, rasteriser, samples, online=True)
     for K_crop, T in zip(pairs.K_crop, pairs.T_cam_obj_hypothesis, strict=True):
         centre = T[:3, :3] @ mesh.center_m + T[:3, 3]
         np.testing.assert_allclose(project(K_crop, centre[None])[0], 32.0, atol=1e-6)

@@ -11,7 +11,7 @@ from posecore.shard import ShardReader
 from refinenet.config import load_config
 from refinenet.data.loader import make_loader
 from refinenet.data.pair_stream import PairSource, PairStream
-from refinenet.data.split import divide, held_out_scenes, read_scenes, spread_rows
+from refinenet.data.split import choose_validation_scenes, divide, read_scenes, spread_rows
 from refinenet.data.validation_set import validation_batches
 from refinenet.geometry import poses
 
@@ -20,14 +20,14 @@ SMALL = [
     "loader.workers=0",
     "loader.shuffle_shards=2",
     "loss.contour_points=32",
-    "validation.scene_share=0.2",
+    "validation.scene_fraction=0.2",
 ]
 
 
 def split_by_scene(reader, share, seed):
     """A dataset's samples for training and for validation."""
     scene_of, _ = read_scenes(reader, reader.committed)
-    return divide(scene_of, held_out_scenes(reader.url, scene_of, share, seed))
+    return divide(scene_of, choose_validation_scenes(reader.url, scene_of, share, seed))
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def take(stream, n):
 
 def assert_equal(first, second):
     for a, b in zip(first, second, strict=True):
-        for x, y in zip((*a.pair, *a.target, a.sample_ids), (*b.pair, *b.target, b.sample_ids), strict=True):
+        for x, y in zip((*a.inputs, *a.target, a.sample_ids), (*b.inputs, *b.target, b.sample_ids), strict=True):
             torch.testing.assert_close(x, y, rtol=0, atol=0)
 
 
@@ -65,7 +65,7 @@ def test_the_split_is_by_scene(dataset):
 
 def test_an_epoch_holds_every_sample_once(dataset, training):
     epochs = training.n * 2 // 4
-    ids = torch.cat([b.sample_ids for b in take(make_stream(dataset, training, ["hypothesis.fresh=false"]), epochs)])
+    ids = torch.cat([b.sample_ids for b in take(make_stream(dataset, training, ["hypothesis.online=false"]), epochs)])
     counts = torch.unique(ids[: training.n], dim=0, return_counts=True)[1]
     assert len(counts) == training.n
     assert not torch.equal(ids[: training.n], ids[training.n : 2 * training.n])
@@ -157,11 +157,11 @@ def test_any_twin_takes_the_symmetries_that_the_dataset_carries(dataset, mesh, t
         return poses.rotation_angle_deg(torch.cat(changes))
 
     assert turned_deg().max() < 11
-    assert (turned_deg("hypothesis.any_twin=true") > 165).any()
+    assert (turned_deg("hypothesis.sample_symmetries=true") > 165).any()
 
 
-def test_held_out_pairs_of_many_shards_fill_batches_and_no_cache(dataset):
-    config = load_config("compact", [*SMALL, "loader.cache_mb=64", "hypothesis.fresh=false"])
+def test_validation_pairs_of_many_shards_fill_batches_and_no_cache(dataset):
+    config = load_config("compact", [*SMALL, "loader.cache_mb=64", "hypothesis.online=false"])
     validation = spread_rows(split_by_scene(ShardReader(str(dataset)), 0.5, 0)[1], 10)
     assert len(validation.rows) > 3
     source = PairSource(str(dataset), config, training=False)

@@ -16,13 +16,13 @@ from posecore.errors import CheckpointError, ConfigError, ShardError, StorageErr
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
 from refinenet.config import load_config
-from refinenet.data.growing_split import Growth
+from refinenet.data.growing_split import GrowingSplit
 from refinenet.data.loader import make_loader
 from refinenet.data.pair_stream import PairStream
-from refinenet.data.split import DataRecord, divide, drawn_out, read_scenes
+from refinenet.data.split import DataRecord, divide, draw_validation_scenes, read_scenes
 from refinenet.models import checkpoint
 from refinenet.training.loop import train
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 
 from ..training.test_training import small
 from .test_pair_stream import SMALL, assert_equal, make_stream, split_by_scene, take
@@ -59,20 +59,20 @@ def damaged(dataset, tmp_path):
 
 def follow(url, out, start=0):
     scene_of, _ = read_scenes(ShardReader(str(url)), [0, 1])
-    record = DataRecord(shards=(0, 1), held_out=HELD_OUT[:2])
-    growth = Growth(out=out, record=record, config=load_config("compact", SMALL))
-    return make_stream(url, divide(scene_of, HELD_OUT)[0], ["hypothesis.fresh=false"], start=start, growth=growth)
+    record = DataRecord(shards=(0, 1), validation_scenes=HELD_OUT[:2])
+    growth = GrowingSplit(out=out, record=record, config=load_config("compact", SMALL))
+    return make_stream(url, divide(scene_of, HELD_OUT)[0], ["hypothesis.online=false"], start=start, growing=growth)
 
 
-def test_a_scene_is_held_out_or_not_whatever_others_there_are():
+def test_a_scene_is_for_validation_or_not_whatever_others_there_are():
     scenes = np.arange(24)
-    assert tuple(drawn_out(scenes, 0.2, 0)) == HELD_OUT
-    assert tuple(drawn_out(scenes[2:15], 0.2, 0)) == HELD_OUT[1:]
-    assert abs(len(drawn_out(np.arange(2000), 0.1, 0)) - 200) < 40
-    assert set(drawn_out(scenes, 0.2, 1)) != set(HELD_OUT)
+    assert tuple(draw_validation_scenes(scenes, 0.2, 0)) == HELD_OUT
+    assert tuple(draw_validation_scenes(scenes[2:15], 0.2, 0)) == HELD_OUT[1:]
+    assert abs(len(draw_validation_scenes(np.arange(2000), 0.1, 0)) - 200) < 40
+    assert set(draw_validation_scenes(scenes, 0.2, 1)) != set(HELD_OUT)
 
 
-def test_new_shards_join_between_epochs_and_held_out_scenes_stay_out(growing, tmp_path):
+def test_new_shards_join_between_epochs_and_validation_scenes_stay_out(growing, tmp_path):
     url, reveal = growing
     stream = follow(url, tmp_path)
     seen = (set(rows) for _, rows in stream._epochs())
@@ -123,23 +123,23 @@ def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, mo
     assert "there are 0 of 1 shards to train on, 0 of 1 scene to hold out" in caplog.text
     joined = [json.loads(path.read_text())["shards"] for path in sorted((tmp_path / "run/growth").iterdir())]
     assert any(joined)
-    held_out = json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"]
+    validation_scenes_now = json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"]
     # Killed and resumed when the dataset is complete: the epochs that have begun stay what they were.
     before = [path.read_text() for path in sorted((tmp_path / "run/growth").iterdir())]
     train(small("loader.follow=true", "steps=34", "batch=4"), str(url), tmp_path / "run", resume=True)
     assert [path.read_text() for path in sorted((tmp_path / "run/growth").iterdir())][: len(before)] == before
-    assert json.loads((tmp_path / "run/data.json").read_text())["held_out_scenes"] == held_out
+    assert json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"] == validation_scenes_now
 
 
-def test_later_shards_bring_held_out_pairs_until_there_are_enough(growing, tmp_path):
+def test_later_shards_bring_validation_pairs_until_there_are_enough(growing, tmp_path):
     url, reveal = growing
-    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "steps=16", "batch=4"]
+    options = ["loader.follow=true", "loader.workers=0", "validation.scene_fraction=0.2", "steps=16", "batch=4"]
 
     def trainer(out, *more, resume=False):
-        return Trainer(small(*options, *more), str(url), tmp_path / out, resume=resume)
+        return open_run(small(*options, *more), str(url), tmp_path / out, resume=resume)
 
     def ids(run):
-        return sorted(map(tuple, torch.cat([batch.sample_ids for batch in run._held_out.batches]).tolist()))
+        return sorted(map(tuple, torch.cat([batch.sample_ids for batch in run.data.validation.batches]).tolist()))
 
     run, enough = trainer("run", "validation.pairs=64"), trainer("enough", "validation.pairs=4")
     first = [(0, 2), (0, 3), (0, 6), (0, 7)]
@@ -167,37 +167,43 @@ def test_later_shards_bring_held_out_pairs_until_there_are_enough(growing, tmp_p
 
 def test_a_run_that_an_earlier_version_began_does_not_follow_on(growing, tmp_path, monkeypatch):
     """It trained on scenes that would be held out now."""
-    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "batch=4"]
-    run = Trainer(small(*options), str(growing[0]), tmp_path)
+    options = ["loader.follow=true", "loader.workers=0", "validation.scene_fraction=0.2", "batch=4"]
+    run = open_run(small(*options), str(growing[0]), tmp_path)
     run.save(None)
     state = checkpoint.load_state(tmp_path, 0)
-    del state["held_out_shards"]
+    del state["validation_shards"]
     monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state)
     with pytest.raises(CheckpointError, match="of an earlier version, which held out less; start a new run"):
-        Trainer(small(*options), str(growing[0]), tmp_path, resume=True)
+        open_run(small(*options), str(growing[0]), tmp_path, resume=True)
 
 
 def test_a_new_run_forgets_what_had_joined_an_earlier_one(tmp_path):
     earlier = tmp_path / "growth/epoch-000001.json"
     earlier.parent.mkdir()
     earlier.write_text('{"shards": [2], "complete": false}')
-    DataRecord(shards=(0, 1), held_out=HELD_OUT).save(tmp_path)
+    DataRecord(shards=(0, 1), validation_scenes=HELD_OUT).save(tmp_path)
     assert not earlier.exists()
-    assert DataRecord.load(tmp_path) == DataRecord(shards=(0, 1), held_out=HELD_OUT)
+    assert DataRecord.load(tmp_path) == DataRecord(shards=(0, 1), validation_scenes=HELD_OUT)
 
 
 def test_a_resumed_run_measures_what_it_did_before_others_joined(growing, tmp_path):
     """Killed after an epoch with new shards began and before they were measured."""
     url, reveal = growing
-    options = ["loader.follow=true", "loader.workers=0", "validation.scene_share=0.2", "validation.pairs=64", "batch=4"]
-    run = Trainer(small(*options), str(url), tmp_path)
+    options = [
+        "loader.follow=true",
+        "loader.workers=0",
+        "validation.scene_fraction=0.2",
+        "validation.pairs=64",
+        "batch=4",
+    ]
+    run = open_run(small(*options), str(url), tmp_path)
     run.save(run.validate())
     reveal(6)
     batches = run.stream()
     while not (tmp_path / "growth").is_dir():
         next(batches)
-    resumed = Trainer(small(*options), str(url), tmp_path, resume=True)
-    assert sum(len(batch.sample_ids) for batch in resumed._held_out.batches) == 4
+    resumed = open_run(small(*options), str(url), tmp_path, resume=True)
+    assert sum(len(batch.sample_ids) for batch in resumed.data.validation.batches) == 4
     assert resumed.best_mm == run.best_mm
     assert resumed.validate()["validation/pairs"] == 6
     assert resumed.best_mm == math.inf
@@ -219,31 +225,31 @@ def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, m
 def test_waiting_for_a_dataset_where_a_file_stands_is_an_error(tmp_path):
     (tmp_path / "shards").write_text("no folder")
     with pytest.raises(StorageError, match="shards: is a file, expected a folder"):
-        Trainer(small("loader.follow=true"), str(tmp_path / "shards"), tmp_path / "run")
+        open_run(small("loader.follow=true"), str(tmp_path / "shards"), tmp_path / "run")
 
 
 def test_an_unknown_object_is_not_waited_for(growing, tmp_path):
     with pytest.raises(ConfigError, match="there is no object 99 in it, only 1"):
-        Trainer(small("loader.follow=true", "objects=[99]"), str(growing[0]), tmp_path / "run")
+        open_run(small("loader.follow=true", "objects=[99]"), str(growing[0]), tmp_path / "run")
 
 
 def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(growing, tmp_path, monkeypatch, caplog):
     """Seed 2 draws out scene 6 first, which comes with the second shard; there are two loader processes to feed."""
     url, reveal = growing
     monkeypatch.setattr("refinenet.data.growing_split.POLL_S", 0.05)
-    assert drawn_out(np.arange(12), 0.1, 2).tolist() == [6]
+    assert draw_validation_scenes(np.arange(12), 0.1, 2).tolist() == [6]
     reveal(1)
     later = [threading.Timer(0.4, lambda: reveal(2)), threading.Timer(0.8, lambda: reveal(3))]
     for timer in later:
         timer.start()
-    options = ["loader.follow=true", "validation.scene_share=0.1", "seed=2", "loader.workers=3"]
+    options = ["loader.follow=true", "validation.scene_fraction=0.1", "seed=2", "loader.workers=3"]
     with caplog.at_level(logging.WARNING):
-        run = Trainer(small(*options), str(url), tmp_path / "run")
+        run = open_run(small(*options), str(url), tmp_path / "run")
     for timer in later:
         timer.join()
     assert "there are 1 of 3 shards to train on, 0 of 1 scene to hold out" in caplog.text
     assert "there are 2 of 3 shards to train on, 1 of 1 scene to hold out" in caplog.text
-    assert set(run.training.rows) == {0, 1, 2}
+    assert set(run.data.training.rows) == {0, 1, 2}
 
 
 def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):
@@ -261,7 +267,7 @@ def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_p
 
 @pytest.mark.parametrize("group", [1, 3])
 def test_others_stand_in_for_damaged_shards_and_the_stream_still_resumes(dataset, damaged, group):
-    options = ["loader.skip_bad_shards=true", f"loader.shuffle_shards={group}", "hypothesis.fresh=false"]
+    options = ["loader.skip_bad_shards=true", f"loader.shuffle_shards={group}", "hypothesis.online=false"]
     split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
     whole = take(make_stream(dataset, split, options), 20)
     mended = take(make_stream(damaged, split, options), 20)
@@ -288,10 +294,10 @@ def test_a_shard_without_scenes_is_left_out_from_the_start(dataset, tmp_path):
     copy = shutil.copytree(dataset, tmp_path / "copy")
     (copy / "scene_index/c/4").unlink()
     with pytest.raises(ShardError, match="scene_index/c/4: found no file"):
-        Trainer(small(), str(copy), tmp_path / "strict")
-    run = Trainer(small("loader.skip_bad_shards=true"), str(copy), tmp_path / "run")
-    assert 4 not in run.training.rows
-    assert len(run.skipped) == 1
+        open_run(small(), str(copy), tmp_path / "strict")
+    run = open_run(small("loader.skip_bad_shards=true"), str(copy), tmp_path / "run")
+    assert 4 not in run.data.training.rows
+    assert len(run.data.skipped) == 1
     assert np.array_equal(DataRecord.load(tmp_path / "run").shards, [0, 1, 2, 3, 5])
 
 

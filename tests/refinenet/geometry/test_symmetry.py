@@ -6,6 +6,8 @@ import torch
 from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
+from refinenet.batch import LossTarget
+from refinenet.config import LossConfig
 from refinenet.data.objects import object_points
 from refinenet.geometry import poses, symmetry
 from refinenet.training import losses, validation
@@ -95,14 +97,14 @@ def target_of(T_true, T_hypothesis):
     flat = torch.zeros(N, 64, 64, dtype=torch.float64)
     K = torch.tensor([[300.0, 0, 32], [0, 300, 32], [0, 0, 1]], dtype=torch.float64).expand(N, 3, 3)
     rows = torch.zeros(N, dtype=torch.int64)
-    return losses.Target(torch.from_numpy(T_true), torch.from_numpy(T_hypothesis), K, none, none, flat, flat, rows)
+    return LossTarget(torch.from_numpy(T_true), torch.from_numpy(T_hypothesis), K, none, none, flat, flat, rows)
 
 
-def test_closeness_of_an_exact_pose_is_one(mesh):
+def test_pose_quality_of_an_exact_pose_is_one(mesh):
     rng = np.random.default_rng(5)
     info = MODELS["axis"]
     T_true = random_poses(rng)
-    close = losses.closeness(target_of(T_true, T_true @ turns(info, rng)), objects_with(mesh, info))
+    close = losses.pose_quality(target_of(T_true, T_true @ turns(info, rng)), objects_with(mesh, info))
     assert close.min() > 0.9999
 
 
@@ -119,7 +121,7 @@ def test_the_contour_loss_does_not_mind_which_twin_is_the_truth(mesh, name):
     target = target._replace(
         scene_contour_m=contour_m, hypothesis_contour_m=contour_m, scene_distance_px=ramp, hypothesis_distance_px=ramp
     )
-    cost = losses.make_loss(name, gamma=1.0, point_weight=0.1, objects=objects_with(mesh, info))
+    cost = losses.make_loss(LossConfig(name=name, gamma=1.0, point_weight=0.1), objects_with(mesh, info))
     update = poses.update_between(target.T_cam_obj_hypothesis, torch.from_numpy(random_poses(rng)))
     other = target._replace(T_cam_obj=torch.from_numpy(T_true @ S))
     torch.testing.assert_close(cost(update, target), cost(update, other), atol=1e-4, rtol=1e-4)

@@ -7,9 +7,9 @@ import onnxruntime
 import pytest
 import torch
 from posecore.errors import CheckpointError, ConfigError
+from refinenet.batch import NetworkInput
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.models import checkpoint, export
-from refinenet.models.networks import Pair
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def test_onnx_gives_the_networks_updates_at_any_batch_size(cli, loaded, tmp_path
     inputs = export.random_pairs(7, 64, seed=3)
     dR, dt = session.run(None, {n: x.numpy() for n, x in zip(export.INPUTS[:4], inputs, strict=True)})[:2]
     with torch.no_grad():
-        update = loaded.network()(Pair(*inputs))
+        update = loaded.network()(NetworkInput(*inputs))
     np.testing.assert_allclose(dR, update.dR.numpy(), atol=1e-4)
     np.testing.assert_allclose(dt, update.dt.numpy(), atol=1e-5)
     assert np.abs(dt).max() > 1e-3  # the pairs are not ones that nothing is done for
@@ -44,7 +44,7 @@ def test_the_exported_program_gives_the_networks_updates(cli, loaded, tmp_path):
     inputs = export.random_pairs(3, 64, seed=4)
     with torch.no_grad():
         dR, dt = program.module()(*inputs)[:2]
-        update = loaded.network()(Pair(*inputs))
+        update = loaded.network()(NetworkInput(*inputs))
     torch.testing.assert_close(dR, update.dR, atol=1e-4, rtol=0)
     torch.testing.assert_close(dt, update.dt, atol=1e-5, rtol=0)
     assert json.loads(extra["refinenet"])["step"] == loaded.provenance.step

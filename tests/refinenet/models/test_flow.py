@@ -9,7 +9,8 @@ from posecore.camera import back_project, crop_K
 from posecore.errors import ConfigError
 from posecore.raster import Rasteriser
 from posecore.window import diameter_window
-from refinenet.config import load_config
+from refinenet.batch import LossTarget
+from refinenet.config import LossConfig, load_config
 from refinenet.data.pair_stream import PairSource
 from refinenet.geometry import poses
 from refinenet.geometry.poses import Flow
@@ -20,9 +21,8 @@ from refinenet.models.networks import FlowNet, make_network
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Status
 from refinenet.training import losses, validation
-from refinenet.training.losses import Target
-from refinenet.training.on_policy import OwnPredictions
-from refinenet.training.run import Trainer
+from refinenet.training.on_policy import OnPolicyHypotheses
+from refinenet.training.setup import open_run
 from scipy.spatial.transform import Rotation
 from torch.autograd import gradcheck
 
@@ -160,7 +160,7 @@ def test_rotations_by_a_vector_are_posecores():
 def targets(scenes):
     truth, guess, K_crop, _ = scenes
     none = torch.zeros(len(truth), 1, 3)
-    return Target(truth, guess, K_crop, none, none, none, none, torch.zeros(len(truth), dtype=torch.int64))
+    return LossTarget(truth, guess, K_crop, none, none, none, none, torch.zeros(len(truth), dtype=torch.int64))
 
 
 def points_of(mesh, *symmetries):
@@ -211,7 +211,7 @@ def test_the_flow_loss_has_true_gradients_also_behind_the_camera(scenes, mesh):
     behind[:, 2, 3] -= 2.0
     value = cost(*leaves, at=target._replace(T_cam_obj=behind))
     assert torch.isfinite(value).all()
-    assert value.max() <= losses.MOST_FLOW_COST
+    assert value.max() <= losses.MAX_FLOW_COST
     assert all(torch.isfinite(g).all() for g in torch.autograd.grad(value.sum(), leaves))
 
 
@@ -239,18 +239,18 @@ def se3_moved(T, moves):
     return turned
 
 
-def test_closeness_is_one_at_the_truth_and_falls_with_what_is_seen_of_the_error(scenes, mesh):
+def test_pose_quality_is_one_at_the_ground_truth_and_falls_with_the_visible_error(scenes, mesh):
     points = points_of(mesh)
     size_m = float((points.points_m.amax(1) - points.points_m.amin(1)).norm())
     still = np.zeros(3)
 
     def at(turn, move):
-        return losses.closeness(hypotheses_at(scenes, (turn, move)), points)
+        return losses.pose_quality(hypotheses_at(scenes, (turn, move)), points)
 
     torch.testing.assert_close(at(still, still), torch.ones(4, dtype=torch.float64))
-    across = at(still, [losses.CLOSE * size_m, 0.0, 0.0])
+    across = at(still, [losses.POSE_QUALITY_SCALE * size_m, 0.0, 0.0])
     np.testing.assert_allclose(across, np.exp(-1), rtol=0.05)  # nearer points move by more pixels
-    in_depth = at(still, [0.0, 0.0, losses.CLOSE * size_m])
+    in_depth = at(still, [0.0, 0.0, losses.POSE_QUALITY_SCALE * size_m])
     assert (in_depth > 0.7).all()
     turned = [at(np.deg2rad(angle) * np.array([0.0, 0.0, 1.0]), still) for angle in (5, 20, 60)]
     assert (turned[0] > turned[1] + 0.1).all() and (turned[1] > 2 * turned[2]).all()
@@ -260,18 +260,20 @@ def test_the_nearest_twin_is_as_close(scenes, mesh):
     half_turn = se3.make_T(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     target = targets(scenes)
     turned = target._replace(T_cam_obj_hypothesis=target.T_cam_obj @ torch.from_numpy(half_turn))
-    torch.testing.assert_close(losses.closeness(turned, points_of(mesh, half_turn)), torch.ones(4, dtype=torch.float64))
-    assert (losses.closeness(turned, points_of(mesh)) < 0.5).all()
+    torch.testing.assert_close(
+        losses.pose_quality(turned, points_of(mesh, half_turn)), torch.ones(4, dtype=torch.float64)
+    )
+    assert (losses.pose_quality(turned, points_of(mesh)) < 0.5).all()
 
 
 def test_the_confidence_is_asked_for_what_the_setting_says(scenes, mesh):
     """Cross-entropy is least for the confidence that says just that."""
-    target = targets(scenes)._replace(overlap=torch.full((4,), 0.25, dtype=torch.float64))
-    close = losses.closeness(target, points_of(mesh))
+    target = targets(scenes)._replace(visible_iou=torch.full((4,), 0.25, dtype=torch.float64))
+    close = losses.pose_quality(target, points_of(mesh))
     update = solved(true_flow(*scenes), scenes[1], scenes[2], mesh)
-    for name, wanted in (("overlap", target.overlap), ("closeness", close)):
+    for name, wanted in (("visible_iou", target.visible_iou), ("pose_quality", close)):
         cost = losses.make_loss(
-            "flow+point", gamma=1.0, point_weight=0.0, confidence_target=name, objects=points_of(mesh)
+            LossConfig(name="flow+point", point_weight=0.0, confidence_target=name), points_of(mesh)
         )
         at = wanted.clamp(1e-6, 1 - 1e-6).logit().requires_grad_()
         (slope,) = torch.autograd.grad(cost(update._replace(confidence=at), target).sum(), at)
@@ -298,16 +300,16 @@ def batch_of(dataset, config, training=True, n=8):
 
 
 def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh):
-    fresh = batch_of(dataset, flow_config())
-    assert batch_of(dataset, small()).pair.hypothesis_depth_m is None
-    config = flow_config("own_predictions.share=1", "own_predictions.begin=0", "own_predictions.full=0")
-    with OwnPredictions(config, {1: mesh}) as own:
-        moved = own(Moves(), fresh, step=3)
-    shape = [batch.pair.hypothesis_depth_m > 0 for batch in (fresh, moved)]
+    online = batch_of(dataset, flow_config())
+    assert batch_of(dataset, small()).inputs.hypothesis_depth_m is None
+    config = flow_config("on_policy.fraction=1", "on_policy.begin=0", "on_policy.full=0")
+    with OnPolicyHypotheses(config, {1: mesh}) as own:
+        moved = own(Moves(), online, step=3)
+    shape = [batch.inputs.hypothesis_depth_m > 0 for batch in (online, moved)]
     assert (shape[0] != shape[1]).float().mean() > 0.01
     with Rasteriser({1: mesh}) as rasteriser:
-        for batch in (fresh, moved):
-            pair = batch.pair
+        for batch in (online, moved):
+            pair = batch.inputs
             layers = rasteriser.render(1, pair.K_crop.double().numpy(), pair.T_cam_obj.double().numpy(), 64, 64)
             there = pair.hypothesis_depth_m.numpy()
             assert ((there > 0) == layers.mask).mean() > 0.999
@@ -316,7 +318,7 @@ def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh
 
 
 def test_stored_pairs_have_their_depth_too(dataset):
-    pairs = batch_of(dataset, flow_config("hypothesis.fresh=false", "window.kind=fixed")).pair
+    pairs = batch_of(dataset, flow_config("hypothesis.online=false", "window.kind=fixed")).inputs
     mask = (pairs.hypothesis_rgb > 0).any(1)
     assert ((pairs.hypothesis_depth_m > 0) == mask).float().mean() > 0.99
 
@@ -324,17 +326,17 @@ def test_stored_pairs_have_their_depth_too(dataset):
 @pytest.mark.slow
 def test_it_learns_where_points_went(dataset, tmp_path):
     """A few steps on one batch: offsets come closer than those that nothing was learnt of, and the pose with them."""
-    trainer = Trainer(flow_config("optimiser.lr=0.003", "steps=150"), str(dataset), tmp_path)
+    trainer = open_run(flow_config("optimiser.lr=0.003", "steps=150"), str(dataset), tmp_path)
     batch = batch_of(dataset, trainer.config)
     network = trainer.network
 
     def error_px():
         network.eval()
         with torch.no_grad():
-            update = network(batch.pair)
-        true_px = offsets_to_px(update.flow, batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.pair.K_crop)
+            update = network(batch.inputs)
+        true_px = offsets_to_px(update.flow, batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.inputs.K_crop)
         off = (update.flow.offset_px - true_px).norm(dim=-1)
-        left = poses.update_between(poses.apply_update(batch.pair.T_cam_obj, update), batch.target.T_cam_obj)
+        left = poses.update_between(poses.apply_update(batch.inputs.T_cam_obj, update), batch.target.T_cam_obj)
         return float(off[update.flow.on_object].mean()), float(poses.rotation_angle_deg(left.dR).mean())
 
     before = error_px()
@@ -351,9 +353,9 @@ def test_every_weight_gets_a_gradient(dataset):
     config = flow_config("network.confidence=true")
     batch = batch_of(dataset, config)
     network = make_network(config.network)
-    update = network(batch.pair)
+    update = network(batch.inputs)
     value = losses.flow_loss(update, batch.target, points_of_dataset(dataset))
-    (value + losses.confidence_loss(update, batch.target.overlap)).mean().backward()
+    (value + losses.confidence_loss(update, batch.target.visible_iou)).mean().backward()
     for name, weight in network.named_parameters():
         assert weight.grad is not None and torch.isfinite(weight.grad).all(), name
         assert weight.grad.abs().sum() > 0, name
@@ -370,7 +372,7 @@ def points_of_dataset(dataset):
 def run(dataset, tmp_path_factory):
     """A checkpoint of a network whose offsets are not zero."""
     out = tmp_path_factory.mktemp("flow")
-    trainer = Trainer(flow_config("network.confidence=true", "network.match_radius=1"), str(dataset), out)
+    trainer = open_run(flow_config("network.confidence=true", "network.match_radius=1"), str(dataset), out)
     with torch.no_grad():
         trainer.network.head.bias.copy_(torch.tensor([0.3, -0.2, 0.0, 0.0, 0.1]))
     trainer.save(None)
@@ -395,16 +397,16 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
     assert 0 <= found.confidence <= 1
 
 
-@pytest.mark.parametrize(("target", "output"), [("overlap", True), ("closeness", True), ("closeness", False)])
+@pytest.mark.parametrize(("target", "output"), [("visible_iou", True), ("pose_quality", True), ("pose_quality", False)])
 def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target, output):
     says = [f"loss.confidence_target={target}"] if output else []
     config = flow_config(f"network.confidence={str(output).lower()}", "network.match_radius=1", *says)
-    trainer = Trainer(config, str(dataset), tmp_path)
+    trainer = open_run(config, str(dataset), tmp_path)
     trainer.save(None)
     trainer.close()
     with Refiner.load(tmp_path / "last.safetensors", {1: mesh}) as refiner:
         assert refiner.scorer == ("learned" if output else "gradient")
-        assert refiner.tells_closeness == (output and target == "closeness")
+        assert refiner.predicts_pose_quality == (output and target == "pose_quality")
 
 
 class Unsure(torch.nn.Module):
@@ -418,24 +420,25 @@ class Unsure(torch.nn.Module):
 def test_validation_measures_the_confidence_against_what_it_is_to_say(dataset):
     batch, points = batch_of(dataset, flow_config("network.confidence=true")), points_of_dataset(dataset)
     errors = {}
-    for target in ("overlap", "closeness"):
-        found = validation.measure(Unsure(), [batch], points, torch.device("cpu"), target)
+    for target in ("visible_iou", "pose_quality"):
+        found = validation.measure(Unsure(), [batch], points, torch.device("cpu"), LossConfig(confidence_target=target))
         errors[target] = found["validation/confidence_error"]
-        wanted = losses.wanted_confidence(target, batch.target, points)
+        wanted = losses.confidence_target(target, batch.target, points)
         assert errors[target] == pytest.approx(float((wanted - 0.5).abs().mean()), rel=1e-5)
-    assert abs(errors["overlap"] - errors["closeness"]) > 0.01
+    assert abs(errors["visible_iou"] - errors["pose_quality"]) > 0.01
 
 
 def test_what_the_loss_leaves_out_is_not_measured(dataset):
-    config = flow_config("network.confidence=true", "loss.min_closeness=0.2")
+    config = flow_config("network.confidence=true", "loss.min_pose_quality=0.2")
     batch, points = batch_of(dataset, config, training=False), points_of_dataset(dataset)
-    close = losses.closeness(batch.target, points)
+    close = losses.pose_quality(batch.target, points)
     counted = close >= 0.2
     assert 0 < counted.sum() < len(counted)
-    before = validation.pose_errors(batch.pair.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
+    before = validation.pose_errors(batch.inputs.T_cam_obj, batch.target.T_cam_obj, batch.target.object_index, points)
 
     def measured(least):
-        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), "closeness", least)
+        loss = LossConfig(confidence_target="pose_quality", min_pose_quality=least)
+        return validation.measure(Unsure(), [batch], points, torch.device("cpu"), loss)
 
     some, every, none = measured(0.2), measured(0.0), measured(0.999)
     assert some["validation/pairs"] == counted.sum()

@@ -11,7 +11,7 @@ from posecore.errors import CheckpointError, ConfigError
 from refinenet.config import load_config
 from refinenet.geometry import poses
 from refinenet.models import checkpoint, inception
-from refinenet.models.networks import CompactNet, Pair, PaperNet, make_network
+from refinenet.models.networks import CompactNet, NetworkInput, PaperNet, make_network
 from refinenet.refine.network_refiner import STOP_ANGLE_DEG, STOP_DISTANCE_M
 from safetensors.torch import load_file, save_file
 
@@ -22,7 +22,7 @@ def make_pair(patch_px, b=2, seed=0):
     T = torch.eye(4).repeat(b, 1, 1)
     T[:, 2, 3] = 0.8
     K = torch.tensor([[340.0, 0, 90], [0, 340.0, -20], [0, 0, 1]]).repeat(b, 1, 1)
-    return Pair(*rgb, T, K)
+    return NetworkInput(*rgb, T, K)
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_training_options_are_checked():
     ):
         load_config("paper", ["augment.occlusion=0.5"])
     with pytest.raises(ConfigError, match=r"begin is 0.7, expected 0 to full, which is 0.5"):
-        load_config("compact", ["own_predictions.begin=0.7"])
+        load_config("compact", ["on_policy.begin=0.7"])
     with pytest.raises(ConfigError, match=r"patch_px is 72, expected a multiple of 32 for kind=plus"):
         load_config("plus", ["network.patch_px=72"])
     config = load_config("paper", ["backbone.name=inception_v3", "backbone.pretrained=false", "steps=5"])

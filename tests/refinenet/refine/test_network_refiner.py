@@ -15,7 +15,7 @@ from refinenet.errors import RefinementError
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.models import checkpoint
-from refinenet.refine.multi_hypothesis import PooledRefiner
+from refinenet.refine.multi_hypothesis import MultiHypothesisRefiner
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Frame, Request, Status
 
@@ -86,7 +86,7 @@ def test_batches_and_single_poses_agree(mesh, trained, frame):
     [
         ((0, 0, -0.5), "at z = -0.475 m it is behind the camera"),
         ((0, 0, 0.01), "behind the camera or reaches it"),
-        ((5.0, 0, 0.7), r"it lies at \(\d+, \d+\) px, outside of the image of 640 x 480 px"),
+        ((5.0, 0, 0.7), r"it lies at \(\d+, \d+\) px, outside the image of 640 x 480 px"),
         ((0, 0, np.nan), "its pose is not finite"),
         ((0, 0, 700.0), "it is 700.* m away .* were millimetres taken for metres"),
     ],
@@ -135,7 +135,7 @@ def test_the_camera_of_another_image_size_is_refused(mesh, trained, frame, width
     image, truths = frame
     with (
         Refiner.load(trained, {1: mesh}) as refiner,
-        pytest.raises(CameraError, match=rf"does not fit an image of {width} x {height} px; it looks like that of 651"),
+        pytest.raises(CameraError, match=rf"does not fit an image of {width} x {height} px; it fits 651"),
     ):
         refiner.refine(cv2.resize(image, (width, height)), K, truths[0], 1)
 
@@ -222,7 +222,7 @@ def test_a_pool_is_ranked_and_its_best_is_returned(mesh, trained, frame, monkeyp
         monkeypatch.setattr(
             refiner, "refine_batch", lambda frame, requests: seen.append(len(requests)) or inner(frame, requests)
         )
-        pools = {scorer: PooledRefiner(refiner, 64, scorer) for scorer in ("gradient", "none")}
+        pools = {scorer: MultiHypothesisRefiner(refiner, 64, scorer) for scorer in ("gradient", "none")}
         found = {s: pool.refine_batch(Frame(image=image, K=K), requests_of(starts)) for s, pool in pools.items()}
         again = pools["gradient"].refine_batch(Frame(image=image, K=K), requests_of(starts))
         at_start = refiner.confidences(Frame(image=image, K=K), requests_of(starts))

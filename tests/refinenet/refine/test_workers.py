@@ -26,7 +26,7 @@ def test_any_number_of_processes_writes_the_same(cli, two_images, trained, tmp_p
         more = ["--overlay", tmp_path / f"pictures{workers}"]
         result = cli("refine", *rest, "--workers", workers, "--out", out, *more)
         assert result.exit_code == 0, result.output
-        assert "4 start poses, 3 refined" in result.stdout
+        assert "4 initial poses, 3 refined" in result.stdout
     one, two = outs
     assert columns(one) == columns(two)
     assert read_sidecar(one) == read_sidecar(two)
@@ -56,7 +56,7 @@ def test_what_was_finished_before_a_damaged_image_is_kept(cli, two_images, train
     rest = ["--checkpoint", trained, "--dataset", root, "--init", start, "--out", out, "--iterations", 1, "--quiet"]
     result = cli("refine", *rest, "--workers", 2)
     assert result.exit_code == 1
-    assert f"Stopped: 1 start poses were not reached, {out} holds the others" in result.stderr
+    assert f"Stopped: 1 initial poses were not reached, {out} holds the others" in result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"Error: {second}")
     assert read_sidecar(out)["initial_lines"] == [3, 4]
 

@@ -5,23 +5,22 @@ import pytest
 from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
-from posecore.symmetry import ContinuousSymmetry
+from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
 from refinenet.refiner import Frame, Refinement, Status
 from refinenet.tracking.state import (
-    Sighting,
-    Standing,
+    Observation,
     TrackingConfig,
     TrackState,
+    TrackStatus,
     at_depths,
-    nearest_copy,
-    next_standing,
+    next_status,
     predicted,
 )
-from refinenet.tracking.tracker import Track, Tracker
+from refinenet.tracking.tracker import ObjectTrack, Tracker
 
 from ..conftest import K
 
-CONFIG = TrackingConfig(sure=0.6, found=0.4, patience=3, depth_step=0.0)
+CONFIG = TrackingConfig(tracking_threshold=0.6, reacquire_threshold=0.4, patience=3, depth_step=0.0)
 T, U, L = TrackState.TRACKING, TrackState.UNCERTAIN, TrackState.LOST
 EMPTY = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
 
@@ -43,15 +42,20 @@ def pose(seed, z=0.7):
     ],
 )
 def test_states(confidences, states):
-    standing, found = Standing(), []
+    standing, found = TrackStatus(), []
     for confidence in confidences:
-        standing = next_standing(standing, confidence, CONFIG)
+        standing = next_status(standing, confidence, CONFIG)
         found.append(standing.state)
     assert found == states
 
 
 def test_thresholds_must_be_in_order():
-    for wrong in ({"sure": 0.3, "found": 0.4}, {"patience": 0}, {"depth_step": 0.5}, {"sure": 1.1}):
+    for wrong in (
+        {"tracking_threshold": 0.3, "reacquire_threshold": 0.4},
+        {"patience": 0},
+        {"depth_step": 0.5},
+        {"tracking_threshold": 1.1},
+    ):
         with pytest.raises(ConfigError, match="expected"):
             TrackingConfig(**wrong)
 
@@ -63,7 +67,7 @@ def test_prediction_goes_on_as_between_two_sightings():
     def at(frames):
         return se3.apply_update(first, se3.rotation_from_rotvec(axis * frames), step_m * frames)
 
-    before, last = Sighting(frame=3, T_cam_obj=first), Sighting(frame=7, T_cam_obj=at(4))
+    before, last = Observation(frame=3, T_cam_obj=first), Observation(frame=7, T_cam_obj=at(4))
     np.testing.assert_allclose(predicted(before, last, 8), at(5), atol=1e-12)
     np.testing.assert_allclose(predicted(before, last, 10), at(7), atol=1e-12)
     np.testing.assert_allclose(predicted(before, last, 40), at(8), atol=1e-12)  # no longer than it was measured
@@ -92,9 +96,9 @@ def test_an_object_of_revolution_does_not_spin(angle_rad):
     info = ModelInfo(diameter_m=0.1, symmetries_continuous=(AXIS,))
     before = pose(2)
     spun = before @ turned_about(*AXIS, angle_rad)
-    np.testing.assert_allclose(nearest_copy(spun, before, info), before, atol=1e-9)
+    np.testing.assert_allclose(nearest_symmetric(spun, before, info), before, atol=1e-9)
     moved = se3.apply_update(before, se3.rotation_from_rotvec(np.array([0.1, 0.05, 0.0])), np.array([0.01, 0, 0]))
-    chosen = nearest_copy(moved @ turned_about(*AXIS, angle_rad), before, info)
+    chosen = nearest_symmetric(moved @ turned_about(*AXIS, angle_rad), before, info)
     sampled = [
         se3.rotation_angle_rad((moved @ turned_about(*AXIS, a))[:3, :3] @ before[:3, :3].T)
         for a in np.linspace(0, 2 * np.pi, 2000)
@@ -105,19 +109,19 @@ def test_an_object_of_revolution_does_not_spin(angle_rad):
 def test_copies_of_discrete_symmetries_and_balls():
     before = pose(3)
     half = ModelInfo(diameter_m=0.1, symmetries_discrete=(HALF_TURN,))
-    np.testing.assert_allclose(nearest_copy(before @ se3.inverse(HALF_TURN), before, half), before, atol=1e-12)
+    np.testing.assert_allclose(nearest_symmetric(before @ se3.inverse(HALF_TURN), before, half), before, atol=1e-12)
     other = ContinuousSymmetry((1.0, 0.0, 0.0), AXIS.offset_m)
     ball = ModelInfo(diameter_m=0.1, symmetries_continuous=(AXIS, other))
     spun = before @ turned_about((0.3, -0.5, 0.7), AXIS.offset_m, 1.3)
-    np.testing.assert_allclose(nearest_copy(spun, before, ball), before, atol=1e-9)
+    np.testing.assert_allclose(nearest_symmetric(spun, before, ball), before, atol=1e-9)
     plain = ModelInfo(diameter_m=0.1)
-    np.testing.assert_array_equal(nearest_copy(spun, before, plain), spun)
+    np.testing.assert_array_equal(nearest_symmetric(spun, before, plain), spun)
 
 
 class Script:
     """A method whose confidences are written down; poses come back as `moved` makes them."""
 
-    name, needs_depth, settings = "script", False, {}
+    name, needs_depth, score_kind, corrects_depth, settings = "script", False, "learned", False, {}
 
     def __init__(self, confidences, moved=lambda T: T):
         self.confidences, self.moved, self.asked = list(confidences), moved, []
@@ -156,7 +160,7 @@ def test_a_lost_object_is_started_again_from_an_offered_pose():
 def test_without_any_pose_to_start_from_nothing_is_asked():
     refiner = Script([])
     (row,) = Tracker(refiner, [1], CONFIG).step(0, EMPTY)
-    assert (row.state, row.T_cam_obj, row.failure) == (L, None, "there is no pose to start from in this frame")
+    assert (row.state, row.T_cam_obj, row.failure) == (L, None, "there is no initial pose in this frame")
     assert not refiner.asked
 
 
@@ -164,7 +168,7 @@ def test_the_motion_model_starts_ahead():
     step_m = np.array([0.01, 0.0, 0.0])
     still = np.eye(3)
     refiner = Script([0.9] * 4, moved=lambda T: se3.apply_update(T, still, step_m))
-    tracker = Tracker(refiner, [1], CONFIG, motion=True)
+    tracker = Tracker(refiner, [1], CONFIG, motion_model=True)
     found = [tracker.step(i, EMPTY, {1: [pose(6)]})[0].T_cam_obj for i in range(3)]
     np.testing.assert_allclose(refiner.asked[1][0], found[0])
     np.testing.assert_allclose(refiner.asked[2][0], found[1] + (found[1] - found[0]), atol=1e-12)
@@ -182,30 +186,32 @@ def test_a_symmetric_object_keeps_its_spin_through_a_track():
 
 
 def test_each_depth_is_asked_for():
-    track = Track(obj_id=1, config=TrackingConfig(depth_step=0.03))
-    assert len(track.wanted(0, [pose(8)])) == 1  # what is offered is taken as it is
-    track.take(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
-    depths = [request.T_cam_obj[2, 3] / pose(8)[2, 3] for request in track.wanted(1, [])]
+    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03))
+    assert len(track.hypotheses(0, [pose(8)])) == 1  # what is offered is taken as it is
+    track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
+    depths = [request.T_cam_obj[2, 3] / pose(8)[2, 3] for request in track.hypotheses(1, [])]
     np.testing.assert_allclose(depths, [1.0, 0.97, 1.03])
 
 
 def test_a_depth_is_left_only_for_one_that_is_clearly_better():
     nearer = pose(8, z=0.68)
     for confidence, z in ((0.61, 0.7), (0.63, 0.68)):
-        track = Track(obj_id=1, config=TrackingConfig())
-        track.take(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
-        track.wanted(1, [])
+        track = ObjectTrack(obj_id=1, config=TrackingConfig())
+        track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
+        track.hypotheses(1, [])
         results = [(pose(8), 0.6), (nearer, confidence), (pose(8, z=0.72), 0.5)]
-        tracked = track.take(
+        tracked = track.update(
             1, [Refinement(T_cam_obj=T, status=Status.CONVERGED, iterations=1, confidence=c) for T, c in results]
         )
         assert tracked.T_cam_obj[2, 3] == pytest.approx(z)
 
 
 def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
-    track = Track(obj_id=1, config=TrackingConfig(sure=0.0, found=0.0, patience=2, depth_step=0.0))
+    track = ObjectTrack(
+        obj_id=1, config=TrackingConfig(tracking_threshold=0.0, reacquire_threshold=0.0, patience=2, depth_step=0.0)
+    )
     for frame, (status, state) in enumerate([(Status.STOPPED, T), (Status.FAILED, U), (Status.FAILED, L)]):
-        track.wanted(frame, [pose(0)])
+        track.hypotheses(frame, [pose(0)])
         found = Refinement(T_cam_obj=pose(0), status=status, iterations=1, confidence=0.0, failure="gone")
-        told = track.take(frame, [found])
+        told = track.update(frame, [found])
         assert (told.state, told.T_cam_obj is None) == (state, status is Status.FAILED)

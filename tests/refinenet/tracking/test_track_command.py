@@ -10,109 +10,29 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-import torch
 from posecore import se3
 from posecore.bop import (
     BopDataset,
-    BopWriter,
     Estimate,
-    FrameRecord,
-    GroundTruth,
     ModelInfo,
     read_results,
     read_sidecar,
-    write_models,
 )
 from posecore.bop import write_results as write
-from posecore.camera import Camera
 from posecore.errors import DatasetError
 from posecore.mesh import load_mesh, save_ply
-from posecore.raster import Instance, Rasteriser
 from posecore.symmetry import ContinuousSymmetry
 from refinenet.baselines.global_search import GradientSearch
-from refinenet.config import load_config
-from refinenet.models import checkpoint
-from refinenet.models.networks import make_network
 from refinenet.refine.network_refiner import Refiner
-from refinenet.refiner import Refinement, Status, make_baseline
-from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile, VideoWriter
-from refinenet.tracking.state import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNJUDGED_TRACKING
-from refinenet.tracking.tracker import Tracker, usual_config
+from refinenet.refine.registry import MethodSettings, make_refiner
+from refinenet.refiner import Refinement, Status
+from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile
+from refinenet.tracking.state import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNSCORED_TRACKING
+from refinenet.tracking.tracker import Tracker, default_config
+from refinenet.tracking.video import VideoWriter
 
-from ..conftest import HEIGHT_PX, WIDTH_PX, K, background
-
-FRAMES, GONE, BACK = 14, range(4, 9), 9
-
-
-def still_checkpoint(path, mesh):
-    """A checkpoint whose network leaves poses where they are: its heads are zero."""
-    config = load_config("compact")
-    network = make_network(config.network)
-    for head in (network.rotation, network.translation):
-        torch.nn.init.zeros_(head.weight)
-    objects = {"1": {"name": "thing", "diameter_m": mesh.diameter_m, "window_side_px": 150.0}}
-    provenance = checkpoint.Provenance(
-        config=config, step=0, dataset_sha256="0" * 64, objects=objects, camera_fx_px=K[0, 0]
-    )
-    checkpoint.save(path, network, provenance)
-    return path
-
-
-@pytest.fixture(scope="module")
-def still(mesh, tmp_path_factory):
-    return still_checkpoint(tmp_path_factory.mktemp("still") / "still.safetensors", mesh)
-
-
-def write_scene(root, mesh, truths, gone, info=None):
-    """The object at these poses before a still background; not in the frames that are `gone`."""
-    behind = background(np.random.default_rng(3))
-    camera = Camera(K=K, width_px=WIDTH_PX, height_px=HEIGHT_PX)
-    with Rasteriser({1: mesh}) as rasteriser, BopWriter(root, "test", 1) as writer:
-        for frame, T in enumerate(truths):
-            layers = rasteriser.render_scene([Instance(obj_id=1, T_cam_obj=T)], K, WIDTH_PX, HEIGHT_PX)
-            mask = (layers.instance == 0) & (frame not in gone)
-            image = np.where(mask[..., None], layers.rgb, behind)
-            gt = GroundTruth(obj_id=1, T_cam_obj=T, gt_index=0)
-            writer.add_frame(
-                frame,
-                FrameRecord(
-                    rgb=image,
-                    depth_m=np.where(mask, layers.depth_m, 0),
-                    camera=camera,
-                    gts=[gt],
-                    masks=[mask],
-                    masks_visib=[mask],
-                ),
-            )
-    write_models(root, {1: mesh}, {} if info is None else {1: info})
-
-
-@pytest.fixture(scope="module")
-def scene(mesh, tmp_path_factory):
-    """A scene in which the object stands, comes nearer by 1 % a frame, is gone, and is back somewhere else."""
-    root = tmp_path_factory.mktemp("scene") / "bop"
-    rng = np.random.default_rng(3)
-    background(rng)
-    first, second = (
-        se3.make_T(se3.random_rotation(rng), np.array([x, 0.01, 6 * mesh.diameter_m])) for x in (-0.08, 0.1)
-    )
-    truths = []
-    for frame in range(FRAMES):
-        T = (first if frame < GONE[0] else second).copy()
-        T[:3, 3] *= 1 - 0.01 * min(frame, GONE[0])
-        truths.append(T)
-    write_scene(root, mesh, truths, GONE)
-    starts = [Estimate(scene_id=1, im_id=i, obj_id=1, T_cam_obj=truths[i]) for i in (0, 2, BACK)]
-    write(root / "start.csv", starts)
-    camera = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "width": WIDTH_PX, "height": HEIGHT_PX}
-    (root / "cam.json").write_text(json.dumps(camera))
-    entry = {
-        "obj_id": 1,
-        "cam_R_m2c": truths[0][:3, :3].ravel().tolist(),
-        "cam_t_m2c": (1e3 * truths[0][:3, 3]).tolist(),
-    }
-    (root / "pose.json").write_text(json.dumps([entry]))
-    return root, truths
+from ..conftest import HEIGHT_PX, WIDTH_PX, K
+from .conftest import BACK, FRAMES, GONE, still_checkpoint, write_scene
 
 
 def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
@@ -123,7 +43,7 @@ def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
         "--patience", 3, "--quiet",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    assert "14 frames, 9 tracking, 2 uncertain, 3 lost; 2 starts from a given pose" in result.stdout
+    assert "14 frames, 9 tracking, 2 uncertain, 3 lost; 2 starts from an initial pose" in result.stdout
     assert "frames/s tracking" in result.stdout
     found = {estimate.im_id: estimate for estimate in read_results(out, BopDataset(root))}
     assert sorted(found) == [i for i in range(FRAMES) if i not in GONE]
@@ -196,7 +116,9 @@ def test_search_is_believed_where_it_does_not_fail(cli, scene, tmp_path, monkeyp
     result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--quiet")
     assert result.exit_code == 0, result.output
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
-    result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--sure", 0.5)
+    result = cli(
+        "track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--tracking-threshold", 0.5
+    )
     assert read_sidecar(out)["states"]["lost"] == FRAMES
     assert "No pose, 3 times: the best pose has a confidence of 0.42" in result.stderr
 
@@ -263,11 +185,11 @@ def test_each_method_is_believed_by_its_own_rule(still, mesh, repository, tug_pl
     for made, usual in (
         (Refiner.load(still, {1: mesh}), GRADIENT_TRACKING),
         (Refiner.load(flow, {1: load_mesh(tug_ply)}), replace(LEARNED_TRACKING, depth_step=0.0)),
-        (make_baseline("search", {1: mesh}, 5), SEARCH_TRACKING),
-        (make_baseline("edge-icp", {1: mesh}, 5), UNJUDGED_TRACKING),
+        (make_refiner(MethodSettings(method="search", iterations=5), {1: mesh}, None), SEARCH_TRACKING),
+        (make_refiner(MethodSettings(method="edge-icp", iterations=5), {1: mesh}, None), UNSCORED_TRACKING),
     ):
         with closing(made):
-            assert usual_config(made) == usual
+            assert default_config(made) == usual
             assert Tracker(made, [1])._tracks[0].config == usual
 
 
@@ -275,7 +197,7 @@ def test_names_with_numbers_are_in_their_order(tmp_path):
     for number in (10, 2, 1):
         cv2.imwrite(str(tmp_path / f"f{number}.png"), np.full((HEIGHT_PX, WIDTH_PX, 3), number, np.uint8))
     folder = ImageFolder(folder=tmp_path, camera=FileCamera(file=tmp_path / "cam.json", K=K))
-    frames = list(folder.frames(make_baseline("edge-icp", {}, 1)))
+    frames = list(folder.frames(make_refiner(MethodSettings(method="edge-icp", iterations=1), {}, None)))
     assert [(number, frame.image[0, 0, 0]) for number, frame in frames] == [(0, 1), (1, 2), (2, 10)]
 
 
@@ -286,7 +208,10 @@ def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
             writer.write(rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8))
     content = (tmp_path / "whole.avi").read_bytes()
     (tmp_path / "cut.avi").write_bytes(content[: len(content) // 2])
-    camera, method = FileCamera(file=tmp_path / "cam.json", K=K), make_baseline("edge-icp", {}, 1)
+    camera, method = (
+        FileCamera(file=tmp_path / "cam.json", K=K),
+        make_refiner(MethodSettings(method="edge-icp", iterations=1), {}, None),
+    )
     assert len(list(VideoFile(file=tmp_path / "whole.avi", camera=camera).frames(method))) == 20
     seen = []
     with pytest.raises(DatasetError, match=r"cut\.avi: ends after frame \d+ of 20, it is damaged or cut off"):
@@ -314,16 +239,20 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
         ([images, *pose], 2, "need --camera"),
         ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "found no numbers fx, fy, cx, cy"),
-        ([images, *pose, *camera], 2, "object 1 has a start pose and no mesh; give its file with --mesh"),
+        ([images, *pose, *camera], 2, "object 1 has an initial pose and no mesh; give its file with --mesh"),
         ([tmp_path / "empty", *pose, *camera], 1, "no images"),
         ([tmp_path / "no.mp4", *pose, *camera], 1, "cannot open it as a video"),
-        ([root, *init, "--sure", 0.2, "--found", 0.4], 2, "expected 0 <= found <= sure"),
+        (
+            [root, *init, "--tracking-threshold", 0.2, "--reacquire-threshold", 0.4],
+            2,
+            "expected 0 <= reacquire_threshold <= tr",
+        ),
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
         ([root, *init, *camera], 2, "--camera is for images and videos"),
         ([root, *init, "--fps", 10], 2, "--fps does nothing without --video: leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
-        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 looks like metres"),
+        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 is probably in metres"),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
         ([tmp_path / "twins", *pose, *camera], 1, "01.png and 1.png have one number"),
         ([root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),
@@ -340,10 +269,16 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     (tmp_path / "none.json").write_text("[]")
     shutil.copy(root / "pose.json", tmp_path / "x.json")
     for arguments, text in (
-        (["--method", "edge-icp", *init, "--sure", 0.9], "--sure does nothing for --method edge-icp, which tells no"),
+        (
+            ["--method", "edge-icp", *init, "--tracking-threshold", 0.9],
+            "--tracking-threshold does nothing for --method edge-icp, which has no",
+        ),
         (["--method", "edge-icp", *init, "--depth-step", 0.1], "--depth-step does nothing for --method edge-icp"),
         (["--method", "edge-icp", *init, "--object", 1, "--object", 9], "no pose of object 9 for scene 1"),
-        (["--method", "edge-icp", "--pose", tmp_path / "none.json"], "none.json: no pose; list where the objects are"),
+        (
+            ["--method", "edge-icp", "--pose", tmp_path / "none.json"],
+            "none.json: no pose; list the initial poses of the objects",
+        ),
         (["--method", "edge-icp", "--pose", tmp_path / "x.json"], "the sidecar of --out and --pose are both"),
     ):
         result = cli("track", root, *arguments, "--out", tmp_path / "x", "--quiet")
@@ -361,8 +296,8 @@ def test_search_is_asked_for_what_is_found(cli, scene, tmp_path, monkeypatch):
     monkeypatch.setattr(GradientSearch, "_refine", refine)
     root, _ = scene
     out = tmp_path / "track.csv"
-    options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--sure", 0.2]
-    assert cli("track", root, *options, "--found", 0.1).exit_code == 0
+    options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--tracking-threshold", 0.2]
+    assert cli("track", root, *options, "--reacquire-threshold", 0.1).exit_code == 0
     assert set(asked) == {0.1}
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
 

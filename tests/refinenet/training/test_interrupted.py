@@ -18,7 +18,7 @@ import torch
 from posecore.errors import CheckpointError, ConfigError, StorageError
 from refinenet.models import checkpoint
 from refinenet.training.loop import train
-from refinenet.training.run import Trainer
+from refinenet.training.setup import open_run
 from safetensors.torch import load_file
 
 from .test_training import small
@@ -44,8 +44,8 @@ def test_the_average_is_saved_and_measured(undisturbed, dataset):
     state = checkpoint.load_state(undisturbed, 6)
     saved = checkpoint.load(undisturbed / "last.safetensors").tensors
     assert any(not torch.equal(saved[name], value) for name, value in state["weights"].items())
-    resumed = Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
-    assert all(torch.equal(saved[name], value) for name, value in resumed.kept.state_dict().items())
+    resumed = open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+    assert all(torch.equal(saved[name], value) for name, value in resumed.eval_network.state_dict().items())
     assert all(torch.equal(state["weights"][name], value) for name, value in resumed.network.state_dict().items())
     lines = [json.loads(line) for line in (undisturbed / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["validation/add_after_mm"] == resumed.validate()["validation/add_after_mm"]
@@ -80,12 +80,12 @@ def test_a_run_is_not_resumed_under_other_circumstances(undisturbed, dataset, tm
     state = checkpoint.load_state(undisturbed, 6)
     monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state | {"world": 4})
     with pytest.raises(ConfigError, match=r"trained by 4 processes and now there are 1; resume with torchrun"):
-        Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+        open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
     monkeypatch.undo()
     record = (undisturbed / "data.json").read_text()
     (undisturbed / "data.json").unlink()
     with pytest.raises(CheckpointError, match=r"data.json: missing or damaged .*start a new run"):
-        Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+        open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
     (undisturbed / "data.json").write_text(record)
 
 
@@ -93,19 +93,19 @@ def test_a_cosine_rate_that_jumps_on_resume_is_said(dataset, tmp_path, caplog):
     options = ["steps=4", "optimiser.warmup_steps=0"]
     train(small(*options), str(dataset), tmp_path)
     with caplog.at_level(logging.WARNING):
-        resumed = Trainer(small(*options, "steps=8"), str(dataset), tmp_path, resume=True)
+        resumed = open_run(small(*options, "steps=8"), str(dataset), tmp_path, resume=True)
     assert "steps was 4 and is now 8, so the cosine rate jumps from 1e-05 to 0.000395" in caplog.text
     values = resumed.take_step(next(resumed.stream()))
     assert values["learning_rate"] == pytest.approx(0.00039485, abs=1e-8)
     resumed.close()
     caplog.clear()
-    Trainer(small(*options), str(dataset), tmp_path, resume=True).close()
+    open_run(small(*options), str(dataset), tmp_path, resume=True).close()
     assert "jumps" not in caplog.text
 
 
 def test_a_best_of_other_pairs_is_forgotten(undisturbed, dataset):
-    same = Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
-    other = Trainer(small(*AVERAGED, "validation.pairs=4"), str(dataset), undisturbed, resume=True)
+    same = open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+    other = open_run(small(*AVERAGED, "validation.pairs=4"), str(dataset), undisturbed, resume=True)
     assert same.best_mm < math.inf
     assert other.best_mm == math.inf
 
@@ -114,7 +114,7 @@ def test_what_a_killed_run_left_goes(undisturbed, dataset):
     left = [undisturbed / ".last.safetensors.123.tmp", undisturbed / "optimiser-0000009.pt"]
     for path in left:
         path.write_bytes(b"half")
-    Trainer(small(*AVERAGED), str(dataset), undisturbed, resume=True)
+    open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
     assert not any(path.exists() for path in left)
     assert (undisturbed / "optimiser-0000006.pt").exists()
 

@@ -1,14 +1,17 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from posecore import contour, se3
 from posecore.raster import Rasteriser
+from refinenet.batch import LossTarget
+from refinenet.config import LossConfig
 from refinenet.data.objects import farthest_points
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.geometry.symmetry import ObjectPoints
 from refinenet.training import losses
-from refinenet.training.losses import Target
 from torch.autograd import gradcheck
 
 PATCH_PX = 128
@@ -28,7 +31,7 @@ def make_target(mesh, rasteriser, pairs, seed=0):
         transforms = [contour.distance_transform_px(contour.contour_mask(layers.mask[i])) for i in range(2)]
         rows.append((truth, guess, K, *points, *transforms))
     columns = [torch.from_numpy(np.stack(column).astype(np.float64)) for column in zip(*rows, strict=True)]
-    return Target(*columns, torch.zeros(len(rows), dtype=torch.int64))
+    return LossTarget(*columns, torch.zeros(len(rows), dtype=torch.int64))
 
 
 def object_points(mesh, symmetries=None):
@@ -82,8 +85,8 @@ def identity(target):
 
 
 @pytest.mark.parametrize("name", ["contour", "contour-forward"])
-def test_contour_loss_vanishes_at_the_true_update_up_to_a_pixel(shifted, name):
-    chosen = losses.make_loss(name, gamma=1.0, point_weight=1.0, objects=None)
+def test_contour_loss_vanishes_at_the_true_update_up_to_a_pixel(mesh, shifted, name):
+    chosen = losses.make_loss(LossConfig(name=name, gamma=1.0), object_points(mesh))
     at_truth = chosen(true_update(shifted), shifted)
     directions = 2 if name == "contour" else 1
     assert (at_truth < 0.6 * directions).all()  # contour pixels lie up to half a pixel inside the silhouette's edge
@@ -124,7 +127,7 @@ def test_gradient_points_home(turned):
 @pytest.mark.parametrize("name", OF_POSES)
 def test_descent_on_each_loss_finds_the_pose(mesh, shifted, name):
     """Gradient descent on the update itself, in the parametrisation of the compact network."""
-    chosen = losses.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
+    chosen = losses.make_loss(LossConfig(name=name, gamma=10.0), object_points(mesh))
     rotation = torch.tensor([[1.0, 0, 0, 0, 1, 0]], dtype=torch.float64).repeat(len(shifted.K_crop), 1).requires_grad_()
     v = torch.zeros(len(shifted.K_crop), 3, dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([rotation, v], lr=0.02)
@@ -153,29 +156,29 @@ def test_distance_is_bilinear_between_pixel_centres():
     torch.testing.assert_close(losses.sample_distance(distance, uv), expected)
 
 
-def test_the_confidence_is_drawn_to_the_visible_overlap(mesh, shifted):
+def test_the_confidence_is_drawn_to_the_visible_iou(mesh, shifted):
     """Added to any loss where there is a confidence; least where its sigmoid is the overlap."""
     b = len(shifted.K_crop)
-    target = shifted._replace(overlap=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
+    target = shifted._replace(visible_iou=torch.linspace(0.1, 0.9, b, dtype=torch.float32))
     logits = torch.zeros(b, requires_grad=True)
-    chosen = losses.make_loss("contour", gamma=1, point_weight=1, confidence_weight=2, objects=object_points(mesh))
+    chosen = losses.make_loss(LossConfig(name="contour", confidence_weight=2.0), object_points(mesh))
     plain, still = losses.contour_loss_px(identity(target), target), identity(target)
     with_logits = chosen(still._replace(confidence=logits), target)
     torch.testing.assert_close(chosen(still, target), plain)
     torch.testing.assert_close((with_logits - plain).float(), torch.full((b,), 2 * float(np.log(2))))
     (gradient,) = torch.autograd.grad(with_logits.sum(), logits)
-    torch.testing.assert_close(gradient, 2 * (0.5 - target.overlap))
+    torch.testing.assert_close(gradient, 2 * (0.5 - target.visible_iou))
 
 
 def test_what_is_far_off_teaches_the_confidence_alone(mesh, turned):
     objects = object_points(mesh)
-    close = losses.closeness(turned, objects)
+    close = losses.pose_quality(turned, objects)
     limit = float(close.median())
     b = len(close)
     still = identity(turned)._replace(confidence=torch.zeros(b, dtype=torch.float64))
-    settings = {"gamma": 1, "point_weight": 1, "confidence_target": "closeness", "objects": objects}
+    config = LossConfig(name="point", confidence_target="pose_quality")
     plain, limited = (
-        losses.make_loss("point", **settings, min_closeness=least)(still, turned) for least in (0.0, limit)
+        losses.make_loss(replace(config, min_pose_quality=least), objects)(still, turned) for least in (0.0, limit)
     )
     alone = losses.confidence_loss(still, close)
     far = close < limit
@@ -197,7 +200,7 @@ def test_outside_the_patch_the_distance_grows_with_the_way_back():
 @pytest.mark.parametrize("name", OF_POSES)
 def test_gradcheck(mesh, turned, name):
     few = turned.mapped(lambda x: x[:2])
-    chosen = losses.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
+    chosen = losses.make_loss(LossConfig(name=name, gamma=10.0), object_points(mesh))
     generator = torch.manual_seed(0)
     quat = torch.tensor([[1.0, 0.02, 0.03, -0.01]] * 2, dtype=torch.float64).requires_grad_()
     dt = (0.003 * torch.randn(2, 3, dtype=torch.float64, generator=generator)).requires_grad_()
@@ -214,7 +217,7 @@ def test_losses_stay_finite_behind_the_camera(mesh, turned):
     for dt in (update.dt, -turned.T_cam_obj_hypothesis[:, :3, 3]):
         leaf = dt.clone().requires_grad_()
         for name in OF_POSES:
-            chosen = losses.make_loss(name, gamma=10.0, point_weight=1.0, objects=object_points(mesh))
+            chosen = losses.make_loss(LossConfig(name=name, gamma=10.0), object_points(mesh))
             values = chosen(PoseUpdate(update.dR, leaf), turned)
             (gradient,) = torch.autograd.grad(values.sum(), leaf)
             assert torch.isfinite(values).all()

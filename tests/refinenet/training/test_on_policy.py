@@ -8,18 +8,18 @@ from posecore import contour
 from refinenet.data.pair_stream import PairSource
 from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
-from refinenet.image.masks import visible_overlap
+from refinenet.image.masks import visible_mask_iou
 from refinenet.models import checkpoint
 from refinenet.training import losses
 from refinenet.training.loop import train
-from refinenet.training.on_policy import OwnPredictions, share_at
-from refinenet.training.run import Trainer
+from refinenet.training.on_policy import OnPolicyHypotheses, fraction_at
+from refinenet.training.setup import open_run
 from safetensors.torch import load_file
 from torch import nn
 
 from .test_training import small
 
-OWN = ["own_predictions.share=1", "own_predictions.begin=0", "own_predictions.full=0"]
+OWN = ["on_policy.fraction=1", "on_policy.begin=0", "on_policy.full=0"]
 
 
 class Moves(nn.Module):
@@ -45,26 +45,26 @@ def batch(dataset):
 
 
 def moved(mesh, batch, *overrides):
-    with OwnPredictions(small(*OWN, *overrides), {1: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN, *overrides), {1: mesh}) as own:
         return own(Moves(), batch, step=3)
 
 
 def test_the_share_grows_and_then_stays():
-    config = small("own_predictions.share=0.6", "own_predictions.begin=0.2", "own_predictions.full=0.6").own_predictions
-    shares = [share_at(config, step, 100) for step in (0, 20, 40, 60, 99)]
+    config = small("on_policy.fraction=0.6", "on_policy.begin=0.2", "on_policy.full=0.6").on_policy
+    shares = [fraction_at(config, step, 100) for step in (0, 20, 40, 60, 99)]
     assert shares == pytest.approx([0, 0, 0.3, 0.6, 0.6])
-    assert share_at(small().own_predictions, 50, 100) == 0
+    assert fraction_at(small().on_policy, 50, 100) == 0
 
 
 def test_hypotheses_go_where_the_network_moved_them(mesh, batch):
     after = moved(mesh, batch)
-    wanted = poses.apply_update(batch.pair.T_cam_obj, Moves()(batch.pair))
-    torch.testing.assert_close(after.pair.T_cam_obj, wanted, atol=1e-5, rtol=0)
+    wanted = poses.apply_update(batch.inputs.T_cam_obj, Moves()(batch.inputs))
+    torch.testing.assert_close(after.inputs.T_cam_obj, wanted, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.target.T_cam_obj, batch.target.T_cam_obj)
     torch.testing.assert_close(after.target.T_cam_obj_hypothesis, wanted, atol=1e-5, rtol=0)
     centre = torch.from_numpy(mesh.center_m.astype(np.float32)).repeat(8, 1, 1)
     at = centre @ wanted[:, :3, :3].transpose(1, 2) + wanted[:, None, :3, 3]
-    assert (poses.project(after.pair.K_crop, at) - 32).abs().max() < 1e-2  # the window inference would cut
+    assert (poses.project(after.inputs.K_crop, at) - 32).abs().max() < 1e-2  # the window inference would cut
 
 
 def test_scene_and_labels_follow_the_new_window(mesh, batch):
@@ -72,7 +72,7 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     from posecore.raster import Rasteriser
 
     after = moved(mesh, batch)
-    K, T = after.pair.K_crop.double().numpy(), after.target.T_cam_obj.double().numpy()
+    K, T = after.inputs.K_crop.double().numpy(), after.target.T_cam_obj.double().numpy()
     with Rasteriser({1: mesh}) as rasteriser:
         truth = rasteriser.render(1, K, T, 64, 64)
     for mask, distance, bits in zip(truth.mask, after.target.scene_distance_px, after.target.scene_bits, strict=True):
@@ -83,8 +83,8 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     home = losses.contour_loss_px(true, after.target)
     assert home.mean() < 0.5 * losses.contour_loss_px(stay, after.target).mean()
     assert home.mean() < 2.5
-    overlap = visible_overlap((after.pair.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
-    np.testing.assert_allclose(after.target.overlap.numpy(), overlap, atol=0.03)
+    overlap = visible_mask_iou((after.inputs.hypothesis_rgb > 0).any(1).numpy(), after.target.scene_bits.numpy())
+    np.testing.assert_allclose(after.target.visible_iou.numpy(), overlap, atol=0.03)
 
 
 def test_renders_keep_the_batchs_colours(mesh, batch):
@@ -95,11 +95,11 @@ def test_renders_keep_the_batchs_colours(mesh, batch):
             b = len(pair.K_crop)
             return PoseUpdate(torch.eye(3).repeat(b, 1, 1), torch.zeros(b, 3))
 
-    with OwnPredictions(small(*OWN), {1: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {1: mesh}) as own:
         after = own(Stays(), batch, step=0)
-    difference = (after.pair.hypothesis_rgb.int() - batch.pair.hypothesis_rgb.int()).abs()
+    difference = (after.inputs.hypothesis_rgb.int() - batch.inputs.hypothesis_rgb.int()).abs()
     assert (difference <= 1).float().mean() > 0.99
-    assert (after.pair.scene_rgb.int() - batch.pair.scene_rgb.int()).abs().float().mean() < 1
+    assert (after.inputs.scene_rgb.int() - batch.inputs.scene_rgb.int()).abs().float().mean() < 1
 
 
 def test_a_network_gone_astray_leaves_pairs_as_they_were(mesh, batch):
@@ -109,19 +109,19 @@ def test_a_network_gone_astray_leaves_pairs_as_they_were(mesh, batch):
             far = torch.tensor([[0.0, 0.0, -9.0], [9.0, 0.0, 0.0], [torch.nan, 0.0, 0.0], [0.0, 0.0, 50.0]])
             return PoseUpdate(torch.eye(3).repeat(b, 1, 1), far.repeat(b // 4, 1))
 
-    with OwnPredictions(small(*OWN), {1: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {1: mesh}) as own:
         after = own(Astray(), batch, step=0)
-    assert torch.equal(after.pair.hypothesis_rgb, batch.pair.hypothesis_rgb)
-    assert torch.equal(after.pair.T_cam_obj, batch.pair.T_cam_obj)
+    assert torch.equal(after.inputs.hypothesis_rgb, batch.inputs.hypothesis_rgb)
+    assert torch.equal(after.inputs.T_cam_obj, batch.inputs.T_cam_obj)
 
 
 def test_part_of_a_batch_is_replaced_and_the_same_part_again(mesh, batch):
-    half = "own_predictions.share=0.5"
+    half = "on_policy.fraction=0.5"
     first, again = moved(mesh, batch, half), moved(mesh, batch, half)
-    changed = (first.pair.T_cam_obj != batch.pair.T_cam_obj).flatten(1).any(1)
+    changed = (first.inputs.T_cam_obj != batch.inputs.T_cam_obj).flatten(1).any(1)
     assert changed.sum() == 4
-    assert torch.equal(first.pair.hypothesis_rgb, again.pair.hypothesis_rgb)
-    assert torch.equal(first.pair.hypothesis_rgb[~changed], batch.pair.hypothesis_rgb[~changed])
+    assert torch.equal(first.inputs.hypothesis_rgb, again.inputs.hypothesis_rgb)
+    assert torch.equal(first.inputs.hypothesis_rgb[~changed], batch.inputs.hypothesis_rgb[~changed])
 
 
 def test_each_object_is_seen_through_its_own_window(mesh, batch):
@@ -129,9 +129,9 @@ def test_each_object_is_seen_through_its_own_window(mesh, batch):
     twice = replace(mesh, vertices_m=2 * mesh.vertices_m)
     index = torch.tensor([0, 1] * 4)
     mixed = batch._replace(target=batch.target._replace(object_index=index))
-    with OwnPredictions(small(*OWN), {7: twice, 3: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {7: twice, 3: mesh}) as own:
         after = own(Moves(), mixed, step=0)
-    T, K = after.pair.T_cam_obj, after.pair.K_crop
+    T, K = after.inputs.T_cam_obj, after.inputs.K_crop
     across = K[:, 0, 0] * mesh.diameter_m / (T[:, :3, :3] @ torch.from_numpy(mesh.center_m).float() + T[:, :3, 3])[:, 2]
     assert across[index == 0].numpy() == pytest.approx(64 / 1.5, rel=0.02)
     assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)
@@ -139,8 +139,8 @@ def test_each_object_is_seen_through_its_own_window(mesh, batch):
 
 def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path):
     everything = small(
-        "own_predictions.share=0.5", "own_predictions.begin=0.2", "own_predictions.full=0.5",
-        "own_predictions.updates=2", "network.confidence=true", "augment.occlusion=0.5", "optimiser.ema_decay=0.9",
+        "on_policy.fraction=0.5", "on_policy.begin=0.2", "on_policy.full=0.5",
+        "on_policy.updates=2", "network.confidence=true", "augment.occlusion=0.5", "optimiser.ema_decay=0.9",
     )  # fmt: skip
     train(everything, str(dataset), tmp_path / "whole")
 
@@ -160,28 +160,28 @@ def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path)
     assert checkpoint.load(tmp_path / "whole" / "last.safetensors").network().confidence is not None
     lines = [json.loads(line) for line in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
     assert 0 < lines[-1]["validation/confidence_error"] < 1
-    assert 0 < lines[0]["visible_share"] < 1
+    assert 0 < lines[0]["visible_fraction"] < 1
 
 
 @pytest.mark.parametrize(
     "switch",
     [
         "network.rotation=quaternion", "network.translation=camera", "network.kind=plus", "network.confidence=true",
-        "window.kind=fixed", "hypothesis.fresh=false", "augment.occlusion=1.0", "own_predictions.share=1.0",
+        "window.kind=fixed", "hypothesis.online=false", "augment.occlusion=1.0", "on_policy.fraction=1.0",
         "loss.name=mse", "stored pairs",
     ],
 )  # fmt: skip
 def test_every_switch_trains_alone(dataset, tmp_path, switch):
-    stored = ["window.kind=fixed", "hypothesis.fresh=false", "network.confidence=true", "own_predictions.share=1"]
+    stored = ["window.kind=fixed", "hypothesis.online=false", "network.confidence=true", "on_policy.fraction=1"]
     switches = stored if switch == "stored pairs" else [switch]
-    if any("own_predictions" in each for each in switches):
-        switches += ["own_predictions.begin=0", "own_predictions.full=0"]
-    trainer = Trainer(small(*switches), str(dataset), tmp_path)
+    if any("on_policy" in each for each in switches):
+        switches += ["on_policy.begin=0", "on_policy.full=0"]
+    trainer = open_run(small(*switches), str(dataset), tmp_path)
     try:
         values = trainer.take_step(next(trainer.stream()))
     finally:
         trainer.close()
     assert all(np.isfinite(float(value)) for value in values.values())
-    assert 0 < float(values["visible_share"]) <= 1
+    assert 0 < float(values["visible_fraction"]) <= 1
     # a confidence's cross-entropy and quaternions are no pixels
     assert ("loss_px" in values) == (switch not in ("network.confidence=true", "loss.name=mse", "stored pairs"))

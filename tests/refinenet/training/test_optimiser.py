@@ -5,11 +5,12 @@ import sys
 
 import pytest
 import torch
+from refinenet.batch import Batch
 from refinenet.config import OptimiserConfig, load_config
-from refinenet.data.pair_stream import Batch
 from refinenet.errors import TrainingError
-from refinenet.training.optimiser import FiniteGuard, RunningAverage, learning_rate, make_optimiser
-from refinenet.training.run import Trainer
+from refinenet.training.finite_guard import FiniteGuard
+from refinenet.training.optimiser import EmaWeights, learning_rate, make_optimiser
+from refinenet.training.setup import open_run
 from torch import nn
 
 from .test_training import SMALL, small
@@ -52,7 +53,7 @@ def test_the_fused_optimiser_takes_the_plain_one_s_steps(name):
 
 def test_the_running_average_is_one():
     network = toy()
-    average = RunningAverage(network, 0.75)
+    average = EmaWeights(network, 0.75)
     wanted = {name: value.clone() for name, value in network.state_dict().items()}
     for step in range(40):
         with torch.no_grad():
@@ -101,7 +102,7 @@ def test_a_late_guard_skips_the_step_and_all_after_it():
 
 def test_a_step_on_a_batch_twice_is_a_step_on_it_once(dataset, tmp_path):
     once, twice = (
-        Trainer(small(*more), str(dataset), tmp_path) for more in (["precision=float32"], ["precision=float32"])
+        open_run(small(*more), str(dataset), tmp_path) for more in (["precision=float32"], ["precision=float32"])
     )
     batch = next(once.stream())
     first, second = once.take_step(batch), twice.take_step(batch, batch)

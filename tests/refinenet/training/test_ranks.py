@@ -43,7 +43,7 @@ def test_two_ranks_learn_what_one_process_learns_with_the_doubled_batch(dataset,
     two, one = (curve(tmp_path / name, "loss_px") for name in ("two", "one"))
     assert len(one) == 6
     assert two == pytest.approx(one, rel=1e-3)
-    shares = [curve(tmp_path / name, "visible_share") for name in ("two", "one")]
+    shares = [curve(tmp_path / name, "visible_fraction") for name in ("two", "one")]
     assert shares[0] == pytest.approx(shares[1], rel=1e-5)
     assert curve(tmp_path / "two", "gradient_norm") == pytest.approx(curve(tmp_path / "one", "gradient_norm"), rel=1e-2)
 
@@ -58,7 +58,7 @@ def test_ranks_end_together_when_one_fails(dataset, tmp_path):
 
 
 def test_two_ranks_resume(dataset, tmp_path):
-    own = [f"own_predictions.{key}" for key in ("share=0.5", "begin=0", "full=0")]
+    own = [f"on_policy.{key}" for key in ("fraction=0.5", "begin=0", "full=0")]
     options = [*settings([*SMALL, *own, "precision=float32", "optimiser.schedule=constant"])]
     assert torchrun(dataset, tmp_path / "whole", *options).returncode == 0
     first = [word.replace("steps=6", "steps=4") for word in options]

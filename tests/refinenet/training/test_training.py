@@ -11,12 +11,12 @@ from refinenet.errors import TrainingError
 from refinenet.models import checkpoint
 from refinenet.models.networks import PaperNet
 from refinenet.training.loop import train
-from refinenet.training.run import Trainer
-from refinenet.training.validation import MetricLog
+from refinenet.training.metric_log import MetricLog
+from refinenet.training.setup import open_run
 from safetensors.torch import load_file
 
 SMALL = [
-    "batch=8", "loader.workers=0", "loader.shuffle_shards=2", "loss.contour_points=32", "validation.scene_share=0.2",
+    "batch=8", "loader.workers=0", "loader.shuffle_shards=2", "loss.contour_points=32", "validation.scene_fraction=0.2",
     "validation.pairs=8", "validation.every=4", "checkpoint_every=2", "log_every=1", "threads=1", "steps=6",
     "network.encoder=[8, 8]", "network.widths=[16, 16]", "network.hidden=32",
 ]  # fmt: skip
@@ -84,8 +84,8 @@ def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_pat
         train(small(), str(dataset), out)
     with pytest.raises(ConfigError, match=r"seed was 0 and is now 1; resume with the same settings"):
         train(small("seed=1"), str(dataset), out, resume=True)
-    with pytest.raises(ConfigError, match=r"validation.scene_share was 0.2 and is now 0.4"):
-        train(small("validation.scene_share=0.4"), str(dataset), out, resume=True)
+    with pytest.raises(ConfigError, match=r"validation.scene_fraction was 0.2 and is now 0.4"):
+        train(small("validation.scene_fraction=0.4"), str(dataset), out, resume=True)
     with pytest.raises(CheckpointError, match="no run to resume"):
         train(small(), str(dataset), tmp_path, resume=True)
     with pytest.raises(CheckpointError, match="a checkpoint of preset compact, expected preset paper"):
@@ -135,14 +135,14 @@ def test_a_damaged_checkpoint_is_one_clean_error(run, tmp_path):
 def test_a_batch_can_be_overfitted(dataset, tmp_path):
     """The whole chain learns: one fixed batch, its loss well down, its poses much nearer."""
     overrides = ["steps=200", "optimiser.lr=0.002", "optimiser.warmup_steps=0", "augment.background=0"]
-    trainer = Trainer(small(*overrides, "network.widths=[32, 64]", "network.hidden=128"), str(dataset), tmp_path)
+    trainer = open_run(small(*overrides, "network.widths=[32, 64]", "network.hidden=128"), str(dataset), tmp_path)
     batch = next(trainer.stream())
     losses = [trainer.take_step(batch)["loss_px"] for _ in range(200)]
     assert losses[-1] < 0.5 * losses[0]
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_step(dataset, tmp_path):
-    trainer = Trainer(small(), str(dataset), tmp_path)
+    trainer = open_run(small(), str(dataset), tmp_path)
     batch = next(trainer.stream())
     broken = batch.target.scene_distance_px.clone()
     broken[3] = torch.nan
@@ -158,7 +158,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(dataset, tmp_path):
 
 def test_every_loss_trains(dataset, tmp_path):
     for name in ("contour", "contour-forward", "mse", "point", "contour+point"):
-        trainer = Trainer(small(f"loss.name={name}"), str(dataset), tmp_path)
+        trainer = open_run(small(f"loss.name={name}"), str(dataset), tmp_path)
         values = trainer.take_step(next(trainer.stream()))
         assert all(np.isfinite(value) for value in values.values())
         assert ("loss_px" in values) == (name != "mse")
@@ -176,9 +176,10 @@ def test_the_paper_preset_takes_a_step(mesh, tmp_path):
     assert isinstance(loaded.network(), PaperNet)
     assert errors["validation/add_after_mm"] > 0
     begun = load_config("paper", [*options[1:], f"init={loaded.path}"])  # which has a stem already
-    trainer = Trainer(begun, str(dataset), tmp_path / "begun", resume=False)
+    trainer = open_run(begun, str(dataset), tmp_path / "begun", resume=False)
     assert all(
-        torch.equal(value, loaded.network().state_dict()[key]) for key, value in trainer.kept.state_dict().items()
+        torch.equal(value, loaded.network().state_dict()[key])
+        for key, value in trainer.eval_network.state_dict().items()
     )
     trainer.close()
 

@@ -1,4 +1,4 @@
-"""Where a network runs."""
+"""Choice of the device of a network."""
 
 import os
 
@@ -7,16 +7,15 @@ from posecore.errors import ConfigError
 
 
 def choose_device(name: str) -> torch.device:
-    """`auto` is a GPU where there is one; under torchrun each local rank takes its own.
+    """Device by name: `auto` is a GPU where there is one; under torchrun each local rank takes the GPU of its number.
 
     Raises:
-        ConfigError: It is none of `auto`, `cpu` and `cuda`; a GPU is asked for and there is none, or fewer than local
-            ranks.
+        ConfigError: The name is unknown, or a GPU is requested and there is none, or fewer than local ranks.
     """
     if name not in ("auto", "cpu", "cuda"):
         raise ConfigError(f"device: found {name!r}, expected auto, cpu or cuda")
     if name == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("device: cuda was asked for and torch finds no GPU here; use --device cpu or auto")
+        raise ConfigError("device: cuda was requested and torch finds no GPU here; use --device cpu or auto")
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return torch.device("cpu")
     rank, count = int(os.environ.get("LOCAL_RANK", "0")), torch.cuda.device_count()

@@ -4,7 +4,7 @@ from posecore.errors import PoseError
 
 
 class TrainingError(PoseError, ArithmeticError):
-    """Training cannot go on: the loss or the gradient is not finite."""
+    """Training cannot continue: the loss or the gradient is not finite."""
 
 
 class LoaderError(PoseError, RuntimeError):
@@ -12,4 +12,4 @@ class LoaderError(PoseError, RuntimeError):
 
 
 class RefinementError(PoseError, RuntimeError):
-    """Poses cannot be refined: the image is none, or this machine's memory is too small for one of them."""
+    """Poses cannot be refined: the image is invalid, or the GPU's memory is too small for a pose."""

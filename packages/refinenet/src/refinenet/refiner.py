@@ -1,13 +1,9 @@
-"""What refines poses: the interface that the network and the baselines share.
+"""Interface of pose refinement methods, shared by the network and the baselines: frame, request, result."""
 
-`refinenet refine --method NAME` takes the network, or a baseline that is listed in `BASELINES`.
-"""
-
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -18,58 +14,54 @@ from posecore.mesh import Mesh
 
 from refinenet.errors import RefinementError
 
-Array = np.ndarray
+HypothesisScorer = Literal["gradient", "learned", "none"]
+"""Ranking of a hypothesis set before refinement: image gradients, the network's confidence, or no ranking."""
+ScoreKind = Literal["learned", "gradients", "search", "none"]
+"""Source of a method's confidences: a trained output of the network; gradient similarity of render and image; a global
+search, which fails below its own threshold; none."""
+
 CENTRE_TOLERANCE = 0.2
-"""A principal point further off the image's centre, as a share of its size, and equally far in both directions, is
-that of an image of another size."""
+"""Largest distance of the principal point from the image's centre, as a fraction of the image size. A larger one that
+is equal in both directions belongs to an image of another size."""
 
 SUSPICIOUS_M = 0.01
-"""A pose nearer than this was divided by a thousand once too often."""
+"""Closer than 1 cm: translation probably converted from millimetres twice."""
 NEAREST_DIAMETERS = 0.6
-"""An object whose centre is nearer than so many diameters reaches the camera."""
+"""Least distance of the object's centre, in diameters; a nearer object reaches the camera."""
 FARTHEST_DIAMETERS = 500.0
-"""A pose further away is in another unit: the object would be about a pixel wide."""
+"""Largest distance in diameters; a farther pose is in another unit, as the object would be about a pixel wide."""
 ROTATION_TOLERANCE = 0.02
-"""Of a rotation's orthonormality; result files are written with few digits."""
-
-NETWORK = "network"
-BASELINES: dict[str, str] = {
-    "edge-icp": "refinenet.baselines.edge_icp:EdgeIcp",
-    "depth-icp": "refinenet.baselines.depth_icp:DepthIcp",
-    "region": "refinenet.baselines.region_tracker:RegionTracker",
-    "search": "refinenet.baselines.global_search:GradientSearch",
-}
-"""By name of the method, `module:class` of a `PoseRefiner` that is made with `(meshes, iterations=...)`."""
+"""Tolerance of the orthonormality check; result files hold few digits."""
 
 
 class Status(StrEnum):
-    """How refinement of one pose ended."""
+    """Outcome of the refinement of a pose."""
 
     CONVERGED = "converged"
     """The last update was small."""
     STOPPED = "stopped"
-    """The iterations were used up before."""
+    """All iterations were used before an update was small."""
     FAILED = "failed"
     """There is no refined pose."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """One image with its camera.
+    """An image with its camera.
 
     Attributes:
         image: RGB.
-        K: Its camera matrix, pixel centres at + 0.5.
-        depth_m: Camera z in metres, 0 where unknown; None where there is no depth.
+        K: Camera matrix, pixel centres at + 0.5.
+        depth_m: Camera z in metres, 0 where unknown; None without depth.
 
     Raises:
-        RefinementError: The image is no 8-bit RGB, or the depth has another size.
+        RefinementError: The image is not 8-bit RGB, or the depth has another size.
         CameraError: K is no camera matrix, or that of an image of another size.
     """
 
-    image: UInt8[Array, "h w 3"]
-    K: Float[Array, "3 3"]
-    depth_m: Float[Array, "h w"] | None = None
+    image: UInt8[np.ndarray, "h w 3"]
+    K: Float[np.ndarray, "3 3"]
+    depth_m: Float[np.ndarray, "h w"] | None = None
 
     def __post_init__(self) -> None:
         image = np.asarray(self.image)
@@ -89,39 +81,38 @@ class Frame:
         if not (0 <= across <= 1 and 0 <= down <= 1) or is_scaled:
             raise CameraError(
                 f"camera matrix: the principal point ({K[0, 2]:.1f}, {K[1, 2]:.1f}) px does not fit an image of "
-                f"{width} x {height} px; it looks like that of {2 * K[0, 2]:.0f} x {2 * K[1, 2]:.0f} px: "
-                "scale K with the image"
+                f"{width} x {height} px; it fits {2 * K[0, 2]:.0f} x {2 * K[1, 2]:.0f} px: scale K with the image"
             )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Request:
-    """One pose to refine: object and start pose (metres, object to camera)."""
+    """A pose to refine: object and initial pose (metres, object to camera)."""
 
     obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Refinement:
-    """One refined pose.
+    """A refined pose.
 
     Attributes:
-        T_cam_obj: Metres; the start pose where it failed.
-        status: How it ended.
-        iterations: Updates that were applied.
-        confidence: In [0, 1], 0 where it failed; None from a method that has none.
-        failure: Why it failed, without a full stop; None where it did not.
-        tried: Every pose that was weighed on the way, with the confidence that it got, those of the search that it is
-            from last; none from a method that follows one pose.
+        T_cam_obj: Metres; the initial pose after a failure.
+        status: Outcome.
+        iterations: Number of applied updates.
+        confidence: In [0, 1], 0 after a failure; None from a method without confidences.
+        failure: Reason of a failure, without a full stop; else None.
+        candidates: All poses that a global search scored, with their confidences; the pose that it chose is last. Empty
+            from a local method.
     """
 
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     status: Status
     iterations: int
     confidence: float | None = None
     failure: str | None = None
-    tried: tuple["Refinement", ...] = ()
+    candidates: tuple["Refinement", ...] = ()
 
     @property
     def failed(self) -> bool:
@@ -129,8 +120,8 @@ class Refinement:
         return self.status is Status.FAILED
 
 
-def unseeable(T_cam_obj: Float[Array, "4 4"], mesh: Mesh) -> str | None:
-    """Why an object cannot even be drawn at a pose (metres), whatever the image; None where it can."""
+def render_obstacle(T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh) -> str | None:
+    """Reason why an object cannot be rendered at a pose (metres) in any image; None where it can."""
     if not np.isfinite(T_cam_obj).all():
         return "its pose is not finite"
     if not se3.is_rotation(T_cam_obj[:3, :3], ROTATION_TOLERANCE):
@@ -145,24 +136,24 @@ def unseeable(T_cam_obj: Float[Array, "4 4"], mesh: Mesh) -> str | None:
 
 
 def require_meshes(requests: Sequence[Request], meshes: Mapping[int, Mesh]) -> None:
-    """Refuse objects that a method was not made for.
+    """Refuse objects whose meshes a method does not have.
 
     Raises:
-        ConfigError: There is one; those that it knows are named.
+        ConfigError: An object has no mesh; the message lists the objects that have one.
     """
     for request in requests:
         if request.obj_id not in meshes:
-            known = ", ".join(map(str, sorted(meshes)))
-            raise ConfigError(f"object {request.obj_id} has no mesh here, there are those of {known}")
+            obj_ids = ", ".join(map(str, sorted(meshes)))
+            raise ConfigError(f"object {request.obj_id} has no mesh here, there are those of {obj_ids}")
 
 
 @runtime_checkable
 class PoseRefiner(Protocol):
-    """A method. Its objects' meshes and its settings were given when it was made."""
+    """A refinement method; its constructor takes the objects' meshes and the settings."""
 
     @property
     def name(self) -> str:
-        """What a report calls it."""
+        """Name in a report."""
         ...
 
     @property
@@ -171,56 +162,36 @@ class PoseRefiner(Protocol):
         ...
 
     @property
+    def score_kind(self) -> ScoreKind:
+        """Source of the confidences."""
+        ...
+
+    @property
+    def corrects_depth(self) -> bool:
+        """Whether updates correct depth well enough that tracking needs no hypotheses at other depths."""
+        ...
+
+    @property
     def settings(self) -> dict[str, Any]:
-        """What the result file's sidecar says of it; JSON values, units in the keys."""
+        """Settings for the result file's sidecar: JSON values, units in the keys."""
         ...
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
-        """Refine poses in one image: a result for each request, in their order.
+        """Refine poses in an image: a result for each request, in the same order.
 
         A pose that cannot be refined is a result with status `FAILED`, not an error.
         """
         ...
 
     def close(self) -> None:
-        """Free what it holds."""
+        """Free the renderers."""
         ...
 
 
 class NetworkRefiner(PoseRefiner, Protocol):
-    """A network as another method uses it."""
+    """A network that another method uses."""
 
     @property
-    def tells_closeness(self) -> bool:
-        """Whether its confidences were trained to say how near a pose is to the truth, turns included."""
+    def predicts_pose_quality(self) -> bool:
+        """Whether confidences were trained on the pose error, rotation included."""
         ...
-
-
-WITH_NETWORK = ("search",)
-"""Those that a network makes more exact, where there is one."""
-WITH_CONFIDENCE = (NETWORK, *WITH_NETWORK)
-"""Those that tell how confident they are of a pose."""
-
-
-def make_baseline(
-    name: str,
-    meshes: Mapping[int, Mesh],
-    iterations: int,
-    *,
-    network: NetworkRefiner | None = None,
-    min_confidence: float | None = None,
-) -> PoseRefiner:
-    """A method of `BASELINES`.
-
-    Args:
-        name: Of the method.
-        meshes: Objects by id.
-        iterations: Most updates of a pose.
-        network: For those of `WITH_NETWORK`, closed with the method.
-        min_confidence: For those of `WITH_CONFIDENCE`, the least that is no failure; the method's own where it is None.
-    """
-    module, _, made = BASELINES[name].partition(":")
-    given = {"network": network, "min_confidence": min_confidence}
-    more = {key: value for key, value in given.items() if value is not None}
-    refiner: PoseRefiner = getattr(importlib.import_module(module), made)(meshes, iterations=iterations, **more)
-    return refiner

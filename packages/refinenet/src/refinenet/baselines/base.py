@@ -1,4 +1,4 @@
-"""The refiner's interface around a function that refines one pose."""
+"""Base class of the baselines: the `PoseRefiner` interface around the refinement of a single pose."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -10,20 +10,20 @@ from posecore import se3
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 
-from refinenet.baselines.patch import Target
-from refinenet.refiner import Frame, Refinement, Request, Status, require_meshes, unseeable
+from refinenet.baselines.patch import TrackedObject
+from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, render_obstacle, require_meshes
 
-Array = np.ndarray
 SMALL_ANGLE_RAD = np.deg2rad(0.5)
 SMALL_DISTANCE = 0.01
-"""Under this angle and this share of the diameter, an update is small."""
+"""An update below this angle and this fraction of the diameter is small."""
 
 FAR_DEG, FAR_DIAMETERS = 60.0, 0.75
-"""A pose further from its start than this, in angle or diameters, has diverged. Chosen on renders."""
+"""A pose farther from its initial pose than this has diverged. Tuned on renders."""
+NOT_VISIBLE = "the object is not visible in the image at the initial pose"
 
 
 class Baseline(ABC):
-    """A `PoseRefiner` that goes through the poses one by one.
+    """A `PoseRefiner` that refines the poses one after the other.
 
     Args:
         meshes: Objects by id.
@@ -32,6 +32,8 @@ class Baseline(ABC):
 
     name: str
     needs_depth: ClassVar[bool] = False
+    score_kind: ScoreKind = "none"
+    corrects_depth: ClassVar[bool] = True
 
     def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:
         self.iterations = iterations
@@ -40,59 +42,63 @@ class Baseline(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """For the sidecar."""
+        """Settings for the sidecar."""
         return {"iterations": self.iterations}
 
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
-        """Refine poses in one image.
+        """Refine poses in an image.
 
         Raises:
             ConfigError: An object has no mesh here.
         """
         require_meshes(requests, self._meshes)
-        return [self._seen(frame, request.T_cam_obj, self._target(request)) for request in requests]
+        return [
+            self._refine_if_renderable(frame, request.T_cam_obj, self._tracked_object(request)) for request in requests
+        ]
 
-    def _seen(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
-        """Refine one pose, if it can be drawn at all."""
-        why = unseeable(T_cam_obj, target.mesh)
-        return failed(T_cam_obj, 0, why) if why else self._refine(frame, T_cam_obj, target)
+    def _refine_if_renderable(
+        self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject
+    ) -> Refinement:
+        """Refine a pose; one that cannot be rendered fails."""
+        obstacle = render_obstacle(T_cam_obj, target.mesh)
+        return failed(T_cam_obj, 0, obstacle) if obstacle else self._refine(frame, T_cam_obj, target)
 
-    def _target(self, request: Request) -> Target:
-        return Target(obj_id=request.obj_id, mesh=self._meshes[request.obj_id], rasteriser=self._rasteriser)
+    def _tracked_object(self, request: Request) -> TrackedObject:
+        return TrackedObject(obj_id=request.obj_id, mesh=self._meshes[request.obj_id], rasteriser=self._rasteriser)
 
     def close(self) -> None:
-        """Free what the renderer holds."""
+        """Free the renderer."""
         self._rasteriser.close()
 
     @abstractmethod
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement: ...
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement: ...
 
 
-def failed(start: Float[Array, "4 4"], iterations: int, why: str) -> Refinement:
-    """The start pose and the reason."""
-    T = np.asarray(start, np.float64)
-    return Refinement(T_cam_obj=T, status=Status.FAILED, iterations=iterations, failure=why)
+def failed(initial: Float[np.ndarray, "4 4"], iterations: int, reason: str) -> Refinement:
+    """A failure: the initial pose and the reason."""
+    T = np.asarray(initial, np.float64)
+    return Refinement(T_cam_obj=T, status=Status.FAILED, iterations=iterations, failure=reason)
 
 
 def refined(
-    start: Float[Array, "4 4"],
-    before: Float[Array, "4 4"],
-    after: Float[Array, "4 4"],
+    initial: Float[np.ndarray, "4 4"],
+    before: Float[np.ndarray, "4 4"],
+    after: Float[np.ndarray, "4 4"],
     iterations: int,
     diameter_m: float,
 ) -> Refinement:
-    """The pose `after`, converged if the last update, which led there from `before`, was small.
+    """The pose `after`; it converged if the last update, from `before`, was small.
 
-    It failed where it is too far from the start for a local method: what it found there is something else.
+    It failed if it is too far from the initial pose for a local method, which has then matched something else.
     """
-    dR, dt_m = se3.update_between(start, after)
-    turned_deg, moved_by = np.rad2deg(se3.rotation_angle_rad(dR)), np.linalg.norm(dt_m) / diameter_m
-    if not (turned_deg <= FAR_DEG and moved_by <= FAR_DIAMETERS):
+    dR, dt_m = se3.update_between(initial, after)
+    angle_deg, distance = np.rad2deg(se3.rotation_angle_rad(dR)), np.linalg.norm(dt_m) / diameter_m
+    if not (angle_deg <= FAR_DEG and distance <= FAR_DIAMETERS):
         return failed(
-            start,
+            initial,
             iterations,
-            f"it diverged: turned by {turned_deg:.0f} deg and moved by {moved_by:.1f} diameters, "
-            f"{FAR_DEG:.0f} deg and {FAR_DIAMETERS:g} diameters are in its reach",
+            f"it diverged: rotated by {angle_deg:.0f} deg and translated by {distance:.1f} diameters, at most "
+            f"{FAR_DEG:.0f} deg and {FAR_DIAMETERS:g} diameters expected",
         )
     dR, dt_m = se3.update_between(before, after)
     small = se3.rotation_angle_rad(dR) < SMALL_ANGLE_RAD and np.linalg.norm(dt_m) < SMALL_DISTANCE * diameter_m

@@ -1,18 +1,17 @@
-"""Gauss-Newton on se(3) about the object's origin, for residuals in the image plane."""
+"""Gauss-Newton steps on se(3) about the object's origin, for residuals in the image plane."""
 
 import numpy as np
 from jaxtyping import Float
 from posecore import se3
 
-Array = np.ndarray
 TUKEY = 4.6851
 """Width of Tukey's weight in standard deviations, for 95 % efficiency on normally distributed residuals."""
 
 
 def projection_jacobian(
-    K: Float[Array, "3 3"], p_cam_m: Float[Array, "n 3"], origin_m: Float[Array, "3"], length_m: float
-) -> Float[Array, "n 2 6"]:
-    """How the projections of surface points move with the object.
+    K: Float[np.ndarray, "3 3"], p_cam_m: Float[np.ndarray, "n 3"], origin_m: Float[np.ndarray, "3"], length_m: float
+) -> Float[np.ndarray, "n 2 6"]:
+    """Jacobian of the projections of surface points with respect to the object's pose.
 
     Args:
         K: Camera matrix.
@@ -34,32 +33,34 @@ def projection_jacobian(
         ],
         axis=1,
     )
-    # d(exp(w) q)/dw = -[q]x with q the point seen from the origin, and g . (w x q) = w . (q x g)
+    # d(exp(w) q)/dw = -[q]x with q the point relative to the origin, and g . (w x q) = w . (q x g)
     by_rotation = np.cross((p_cam_m - origin_m)[:, None], by_point)
     return np.concatenate([by_rotation, by_point * length_m], axis=-1)
 
 
 def step(
-    J: Float[Array, "n 6"], residual: Float[Array, " n"], weight: Float[Array, " n"], damping: float
-) -> Float[Array, "6"]:
-    """The x that makes sum w (r + J x)^2 smallest, held back where the rows say nothing.
+    J: Float[np.ndarray, "n 6"], residual: Float[np.ndarray, " n"], weight: Float[np.ndarray, " n"], damping: float
+) -> Float[np.ndarray, "6"]:
+    """The x that minimises sum w (r + J x)^2, damped.
 
     Args:
         J: Rows.
-        residual: Of each row.
+        residual: Residual of each row.
         weight: Not negative.
-        damping: Share of the mean diagonal that is added to the diagonal: a direction without evidence, such as a
-            turn about an axis of symmetry, gets no step.
+        damping: Fraction of the mean diagonal that is added to the diagonal: a direction without evidence, such as a
+            rotation about an axis of symmetry, gets no step.
     """
     H = J.T @ (J * weight[:, None])
     return np.asarray(np.linalg.solve(H + (damping * np.trace(H) / 6 + 1e-12) * np.eye(6), -J.T @ (weight * residual)))
 
 
-def moved(T_cam_obj: Float[Array, "4 4"], x: Float[Array, "6"], length_m: float) -> Float[Array, "4 4"]:
-    """The pose after a step of `step`, whose translation is in `length_m`."""
+def apply_step(
+    T_cam_obj: Float[np.ndarray, "4 4"], x: Float[np.ndarray, "6"], length_m: float
+) -> Float[np.ndarray, "4 4"]:
+    """The pose after a step x of `step`, whose translation is in units of `length_m`."""
     return se3.apply_update(T_cam_obj, se3.rotation_from_rotvec(x[:3]), x[3:] * length_m)
 
 
-def tukey_weight(residual: Float[Array, " n"], sigma: float) -> Float[Array, " n"]:
+def tukey_weight(residual: Float[np.ndarray, " n"], sigma: float) -> Float[np.ndarray, " n"]:
     """Tukey's biweight: 1 for no residual, 0 from 4.7 standard deviations on."""
     return np.square(1 - np.square(residual / (TUKEY * sigma)).clip(0, 1))

@@ -1,4 +1,4 @@
-"""Compiled loops of the refiners without a network."""
+"""Compiled loops of the baselines."""
 
 from typing import no_type_check
 
@@ -8,8 +8,8 @@ from posecore.numba_jit import compiled
 
 @compiled
 @no_type_check
-def mean_response(T_cam_obj, K, nearest, points_m, normals, seen_until_m, responses):
-    """Behind `SparseViews.agreement`; `nearest` are viewpoints."""
+def mean_response(T_cam_obj, K, nearest, points_m, normals, occluder_depth_m, responses):
+    """Loop of `ViewpointModel.similarity`; `nearest` holds the index of each pose's viewpoint."""
     result = np.zeros(len(T_cam_obj))
     bins, side = responses.shape[0], responses.shape[1]
     n = points_m.shape[1]
@@ -25,7 +25,7 @@ def mean_response(T_cam_obj, K, nearest, points_m, normals, seen_until_m, respon
             row = np.floor(K[1, 1] * y_cam / z_cam + K[1, 2])
             if not (0 <= column < side and 0 <= row < side):
                 count += 1
-            elif z_cam < seen_until_m[int(row), int(column)]:
+            elif z_cam < occluder_depth_m[int(row), int(column)]:
                 count += 1
                 x, y, z = normals[v, k, 0], normals[v, k, 1], normals[v, k, 2]
                 dx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z

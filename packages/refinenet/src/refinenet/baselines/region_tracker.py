@@ -1,4 +1,4 @@
-"""Region tracking: the silhouette that parts the object's colours from the background's best.
+"""Region tracking: the silhouette that best separates the colours of object and background.
 
 Global colour histograms, pixel-wise posteriors and a smoothed step over the silhouette's signed distance as in PWP3D
 (Prisacariu and Reid 2012), optimised by Gauss-Newton from coarse to fine as in Tjaden, Schwanecke and Schoemer 2016.
@@ -12,28 +12,27 @@ from posecore.camera import back_project
 from posecore.contour import contour_mask
 from scipy.ndimage import distance_transform_edt, gaussian_filter
 
-from refinenet.baselines.base import Baseline, failed, refined
-from refinenet.baselines.gauss_newton import moved, projection_jacobian, step
-from refinenet.baselines.patch import Target, View, finest_px, look
+from refinenet.baselines.base import NOT_VISIBLE, Baseline, failed, refined
+from refinenet.baselines.gauss_newton import apply_step, projection_jacobian, step
+from refinenet.baselines.patch import ObjectPatch, TrackedObject, finest_px, render_and_crop
 from refinenet.refiner import Frame, Refinement
 
-Array = np.ndarray
 LEVELS = ((0.3, 0.09), (0.55, 0.045), (1.0, 0.01))
-"""Patch side as a share of the finest, and the margin along the silhouette whose colours are not learnt, as a share of
-that side. Like all below: chosen on renders."""
+"""Patch side as a fraction of the finest, and the margin along the silhouette that the histograms leave out, as a
+fraction of that side. Like all below: tuned on renders."""
 FINEST_PX = 200
 LEAST_PATCH_PX = 48
 BINS = 32
 BAND_PX = 10.0
 """Pixels this near the silhouette count."""
 SHARPNESS = 1.0
-"""Of the smoothed step, per pixel."""
-RENDER_SHARE = 0.4
-"""Weight of the render's colours among the object's: parts along its edge are in no margin there."""
+"""Slope of the smoothed step, per pixel."""
+RENDER_WEIGHT = 0.4
+"""Weight of the render's colours in the object's histogram: the render needs no margin along its edge."""
 MIN_CONTOUR = 20
 MIN_PIXELS = 40
 MIN_SEPARATION = 0.02
-"""Least difference of the mean posterior inside and outside: without one the colours say nothing."""
+"""Least difference of the mean posterior inside and outside: below it the colours hold no evidence."""
 LEAST_COST = 0.05
 DAMPING = 1e-3
 STEPS_A_RENDER = 2
@@ -44,42 +43,43 @@ class RegionTracker(Baseline):
 
     name = "region"
 
-    def _refine(self, frame: Frame, T_cam_obj: Float[Array, "4 4"], target: Target) -> Refinement:
+    def _refine(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"], target: TrackedObject) -> Refinement:
         return refine_by_regions(frame.image, frame.K, T_cam_obj, target, self.iterations)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Colours:
-    """How often each colour occurs: (BINS, BINS, BINS) shares that sum to 1, on the object and beside it."""
+    """Colour histograms of object and background: (BINS, BINS, BINS) frequencies that sum to 1."""
 
-    object: Float[Array, "bins bins bins"]
-    background: Float[Array, "bins bins bins"]
+    object: Float[np.ndarray, "bins bins bins"]
+    background: Float[np.ndarray, "bins bins bins"]
 
-    def posterior(self, rgb: UInt8[Array, "h w 3"]) -> Float[Array, "h w"]:
-        """How likely a pixel is the object's, if both were as likely before."""
+    def posterior(self, rgb: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+        """Posterior probability of the object at each pixel, with equal priors."""
         r, g, b = np.moveaxis(rgb.astype(np.int64) * BINS // 256, -1, 0)
-        mine, other = self.object[r, g, b], self.background[r, g, b]
-        return np.asarray((mine + 1e-6) / (mine + other + 2e-6))
+        inside, outside = self.object[r, g, b], self.background[r, g, b]
+        return np.asarray((inside + 1e-6) / (inside + outside + 2e-6))
 
 
-def colours_of(view: View, margin_px: float) -> Colours | None:
-    """Histograms of the silhouette and of what is beside it; None where one has too few pixels.
+def learn_colours(patch: ObjectPatch, margin_px: float) -> Colours | None:
+    """Histograms inside and outside the silhouette; None where a side has too few pixels.
 
-    A margin on either side of the silhouette's edge is left out: where the silhouette is a little off, each side's
-    margin has the other's colours, and colours that are to be seen nowhere else would hold it where it is.
+    A margin on either side of the silhouette's edge is left out. Where the silhouette is a little off, each margin has
+    the other side's colours, and colours that occur nowhere else would hold the silhouette in place.
     """
-    phi = signed_distance_px(view.mask)[0]
-    inside, outside = view.mask & view.seeable, (phi < -margin_px) & view.seeable
+    phi = signed_distance_px(patch.mask)[0]
+    inside, outside = patch.mask & patch.visible, (phi < -margin_px) & patch.visible
     inside &= phi > min(margin_px, 0.5 * float(phi.max()))
     if inside.sum() < MIN_PIXELS or outside.sum() < MIN_PIXELS:
         return None
-    seen, rendered = _histogram(view.scene_rgb[inside]), _histogram(view.rgb[view.mask])
+    observed, rendered = _histogram(patch.scene_rgb[inside]), _histogram(patch.rgb[patch.mask])
     return Colours(
-        object=(1 - RENDER_SHARE) * seen + RENDER_SHARE * rendered, background=_histogram(view.scene_rgb[outside])
+        object=(1 - RENDER_WEIGHT) * observed + RENDER_WEIGHT * rendered,
+        background=_histogram(patch.scene_rgb[outside]),
     )
 
 
-def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
+def _histogram(rgb: UInt8[np.ndarray, "n 3"]) -> Float[np.ndarray, "bins bins bins"]:
     index = rgb.astype(np.int64) * BINS // 256
     counts = np.bincount(index @ np.array([BINS * BINS, BINS, 1]), minlength=BINS**3).reshape(BINS, BINS, BINS)
     smooth = gaussian_filter(counts.astype(np.float64), 0.7)
@@ -87,87 +87,87 @@ def _histogram(rgb: UInt8[Array, "n 3"]) -> Float[Array, "bins bins bins"]:
 
 
 def refine_by_regions(
-    image: UInt8[Array, "h w 3"],
-    K: Float[Array, "3 3"],
-    T_cam_obj: Float[Array, "4 4"],
-    target: Target,
+    image: UInt8[np.ndarray, "h w 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    target: TrackedObject,
     iterations: int = 5,
 ) -> Refinement:
-    """Refine one pose.
+    """Refine a pose.
 
     Args:
         image: RGB.
-        K: Its camera.
-        T_cam_obj: Start pose, metres; its silhouette gives the first histograms, the pose of each level the next ones.
+        K: Camera matrix.
+        T_cam_obj: Initial pose, metres; its silhouette gives the first histograms, the pose of each level the next.
         target: Object.
-        iterations: Times `STEPS_A_RENDER` renders, each with one Gauss-Newton step, at each of three resolutions.
+        iterations: `STEPS_A_RENDER` times as many renders, each with a Gauss-Newton step, at each of three resolutions.
     """
     before = pose = np.asarray(T_cam_obj, np.float64)
     finest = finest_px(K, pose, target.mesh, FINEST_PX)
     if not finest:
-        return failed(T_cam_obj, 0, "the start pose shows nothing of the object in the image")
+        return failed(T_cam_obj, 0, NOT_VISIBLE)
     length_m, done, probable = target.mesh.diameter_m / 2, 0, image
-    for share, margin in LEVELS:
-        patch_px = max(LEAST_PATCH_PX, round(share * finest))
-        view = look(image, K, pose, target, finest)
-        if view is None:
+    for fraction, margin in LEVELS:
+        patch_px = max(LEAST_PATCH_PX, round(fraction * finest))
+        patch = render_and_crop(image, K, pose, target, finest)
+        if patch is None:
             return failed(T_cam_obj, done, "the object is not in the image")
-        colours = colours_of(view, margin * finest)
+        colours = learn_colours(patch, margin * finest)
         if colours is None:
-            return failed(T_cam_obj, done, f"under {MIN_PIXELS} pixels of object or background to learn colours from")
+            return failed(T_cam_obj, done, f"under {MIN_PIXELS} pixels of object or background for the histograms")
         probable = _as_image(colours.posterior(image))
         for _ in range(STEPS_A_RENDER * iterations):
-            view = look(probable, K, pose, target, patch_px)
-            if view is None:
+            patch = render_and_crop(probable, K, pose, target, patch_px)
+            if patch is None:
                 return failed(T_cam_obj, done, "the object is not in the image")
-            if (contour_mask(view.mask) & view.seeable).sum() < MIN_CONTOUR:
+            if (contour_mask(patch.mask) & patch.visible).sum() < MIN_CONTOUR:
                 return failed(T_cam_obj, done, f"the silhouette has under {MIN_CONTOUR} pixels of contour in the image")
-            before, pose = pose, moved(pose, _update(view, pose, length_m), length_m)
+            before, pose = pose, apply_step(pose, _update(patch, pose, length_m), length_m)
             done += 1
-    view = look(probable, K, pose, target, finest)
-    if view is None:
+    patch = render_and_crop(probable, K, pose, target, finest)
+    if patch is None:
         return failed(T_cam_obj, done, "the object left the image")
-    at = view.scene_rgb[..., 0] / 255
-    separation = at[view.mask & view.seeable].mean() - at[~view.mask & view.seeable].mean()
+    posterior = patch.scene_rgb[..., 0] / 255
+    separation = posterior[patch.mask & patch.visible].mean() - posterior[~patch.mask & patch.visible].mean()
     if separation < MIN_SEPARATION:
         return failed(T_cam_obj, done, "object and background have the same colours")
     return refined(T_cam_obj, before, pose, done, target.mesh.diameter_m)
 
 
-def _as_image(probable: Float[Array, "h w"]) -> UInt8[Array, "h w 3"]:
-    """Posteriors as grey levels, cut and scaled like an image: colours are looked up before they are blended."""
+def _as_image(probable: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Posteriors as grey levels, to crop and resample like an image: colours are classified before blending."""
     return np.repeat(np.round(255 * probable).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def signed_distance_px(mask: Bool[Array, "p p"]) -> tuple[Float[Array, "p p"], Array]:
+def signed_distance_px(mask: Bool[np.ndarray, "p p"]) -> tuple[Float[np.ndarray, "p p"], np.ndarray]:
     """Distance to the silhouette's edge, positive inside, and (2, p, p) row and column of the nearest contour pixel.
 
-    The edge runs half a pixel outside of the contour pixels' centres.
+    The edge runs half a pixel outside the contour pixels' centres.
     """
     distance, nearest = distance_transform_edt(~contour_mask(mask), return_indices=True)
     return np.where(mask, distance + 0.5, 0.5 - distance), nearest
 
 
-def _update(view: View, pose: Float[Array, "4 4"], length_m: float) -> Float[Array, "6"]:
-    """One Gauss-Newton step on the summed negative log likelihood of the pixels around the silhouette.
+def _update(patch: ObjectPatch, pose: Float[np.ndarray, "4 4"], length_m: float) -> Float[np.ndarray, "6"]:
+    """A Gauss-Newton step on the summed negative log likelihood of the pixels around the silhouette.
 
-    The view's image holds posteriors, see `_as_image`.
+    The patch's image holds posteriors, see `_as_image`.
     """
-    phi, nearest = signed_distance_px(view.mask)
-    row, column = np.nonzero((np.abs(phi) < BAND_PX) & view.seeable)
-    probable = view.scene_rgb[row, column, 0] / 255
-    at = phi[row, column]
+    phi, nearest = signed_distance_px(patch.mask)
+    row, column = np.nonzero((np.abs(phi) < BAND_PX) & patch.visible)
+    probable = patch.scene_rgb[row, column, 0] / 255
+    distance_px = phi[row, column]
     # Logistic, not the arc tangent of the paper, whose long tails let far pixels push the size.
-    inside = 1 / (1 + np.exp(-SHARPNESS * at))
+    inside = 1 / (1 + np.exp(-SHARPNESS * distance_px))
     slope = SHARPNESS * inside * (1 - inside)
     likelihood = (inside * probable + (1 - inside) * (1 - probable)).clip(1e-3)
     cost = -np.log(likelihood)
     dy, dx = np.gradient(phi)
     edge_row, edge_column = nearest[:, row, column]
     uv_px = np.stack([edge_column, edge_row], -1) + 0.5
-    points_m = back_project(view.K, uv_px, view.depth_m[edge_row, edge_column].astype(np.float64))
-    by_pose = projection_jacobian(view.K, points_m, pose[:3, 3], length_m)
-    # The silhouette moves with its contour points: where they go outwards, distances inside grow.
+    points_m = back_project(patch.K, uv_px, patch.depth_m[edge_row, edge_column].astype(np.float64))
+    by_pose = projection_jacobian(patch.K, points_m, pose[:3, 3], length_m)
+    # The silhouette moves with its contour points: an outward motion increases the distances inside.
     outwards = -np.stack([dx[row, column], dy[row, column]], -1)
     grow = np.einsum("ni,nij->nj", outwards, by_pose)
     J = ((1 - 2 * probable) * slope / likelihood)[:, None] * grow

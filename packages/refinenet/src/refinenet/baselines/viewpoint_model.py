@@ -1,9 +1,9 @@
-"""An object's edges as points on its surface, seen from all around: poses are judged without being drawn.
+"""Sparse viewpoint model: edge points of an object from viewpoints all around it, to score poses without rendering.
 
-Edges of a render hardly change within a few degrees. So they are taken once from each of many viewpoints, and a pose is
-judged by where it puts those of the nearest: microseconds instead of the milliseconds of a render.
+Edges of a render hardly change within a few degrees. So edge points are sampled once from each viewpoint, and a pose is
+scored at the projections of the nearest viewpoint's points: microseconds instead of the milliseconds of a render.
 
-Source: the sparse viewpoint model of Stoiber et al., SRT3D, IJCV 2022.
+Source: Stoiber et al., SRT3D, IJCV 2022.
 """
 
 from dataclasses import dataclass
@@ -20,9 +20,8 @@ from scipy.spatial import cKDTree
 from refinenet.baselines.kernels import mean_response
 from refinenet.image.edge_gradients import RENDER_EDGE, render_gradients
 
-Array = np.ndarray
 VIEWPOINTS = 642
-"""8 degrees from each to the next."""
+"""8 degrees between neighbours."""
 POINTS = 160
 VIEW_PX = 96
 DISTANCE_DIAMETERS = 5.0
@@ -31,49 +30,48 @@ BATCH = 64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class SparseViews:
-    """Edges from v viewpoints, n points each.
+class ViewpointModel:
+    """Edge points of an object: n points from each of v viewpoints.
 
     Attributes:
-        center_m: The object's box centre, object frame.
-        viewpoints: Finds the nearest of the unit vectors from the centre towards the cameras, object frame.
+        center_m: Centre of the object's box, object frame.
+        viewpoints: Unit vectors from the centre to the viewpoints' cameras, object frame.
         points_m: (v, n, 3) object frame.
-        normals: (v, n, 3) unit, object frame: across the edge in the image.
+        normals: (v, n, 3) unit vectors across the edge in the image, object frame.
     """
 
-    center_m: Float[Array, "3"]
+    center_m: Float[np.ndarray, "3"]
     viewpoints: cKDTree
-    points_m: Float[Array, "v n 3"]
-    normals: Float[Array, "v n 3"]
+    points_m: Float[np.ndarray, "v n 3"]
+    normals: Float[np.ndarray, "v n 3"]
 
-    def agreement(
+    def similarity(
         self,
-        T_cam_obj: Float[Array, "b 4 4"],
-        K: Float[Array, "3 3"],
-        seen_until_m: Float[Array, "p p"],
-        responses: Float[Array, "o p p"],
-    ) -> Float[Array, " b"]:
-        """Mean response at the edges of poses, all in front of the camera.
+        T_cam_obj: Float[np.ndarray, "b 4 4"],
+        K: Float[np.ndarray, "3 3"],
+        occluder_depth_m: Float[np.ndarray, "p p"],
+        responses: Float[np.ndarray, "o p p"],
+    ) -> Float[np.ndarray, " b"]:
+        """Mean response at the edge points of poses in front of the camera.
 
-        Points outside of the patch count 0. Those outside of the image, or behind what is known to be there, do not
-        count, up to half of all.
+        Points outside the patch score 0. Points outside the image or behind a known occluder do not count, up to half
+        of the points.
 
         Args:
             T_cam_obj: Poses, metres.
             K: Camera of the patch.
-            seen_until_m: Camera z up to which a patch pixel shows what is there: 0 outside of the image, else infinite
-                where nothing is known to be.
-            responses: For orientations evenly over half a turn, how well the image's edges agree.
+            occluder_depth_m: Camera z of the nearest known occluder; inf where none, 0 outside the image.
+            responses: Response map of each orientation, evenly over half a turn.
         """
         R, centre_m = T_cam_obj[:, :3, :3], T_cam_obj[:, :3, :3] @ self.center_m + T_cam_obj[:, :3, 3]
         towards = -np.einsum("bji,bj->bi", R, centre_m) / np.linalg.norm(centre_m, axis=1, keepdims=True)
         nearest = self.viewpoints.query(towards)[1]
         T = np.ascontiguousarray(T_cam_obj, np.float64)
-        return np.asarray(mean_response(T, K, nearest, self.points_m, self.normals, seen_until_m, responses))
+        return np.asarray(mean_response(T, K, nearest, self.points_m, self.normals, occluder_depth_m, responses))
 
 
-def sparse_views(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> SparseViews:
-    """Edges of an object that a rasteriser draws."""
+def make_viewpoint_model(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> ViewpointModel:
+    """Viewpoint model of an object that the rasteriser holds."""
     z = se3.even_directions(VIEWPOINTS)
     R = se3.rotations_along(z)
     T = se3.make_T(R, np.array([0.0, 0.0, DISTANCE_DIAMETERS * mesh.diameter_m]) - R @ mesh.center_m)
@@ -81,24 +79,26 @@ def sparse_views(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> SparseViews
     K = np.array([[f_px, 0.0, VIEW_PX / 2], [0.0, f_px, VIEW_PX / 2], [0.0, 0.0, 1.0]])
     rng = np.random.default_rng(0)
     points, normals = [], []
-    for start in range(0, VIEWPOINTS, BATCH):
-        batch = T[start : start + BATCH]
+    for first in range(0, VIEWPOINTS, BATCH):
+        batch = T[first : first + BATCH]
         layers = rasteriser.render(obj_id, K, batch, VIEW_PX, VIEW_PX)
         assert layers.rgb is not None
         unit, strength = render_gradients(layers.rgb, layers.mask)
         for T_cam_obj, depth_m, mask, direction, edge in zip(
             batch, layers.depth_m, layers.mask, unit, strength, strict=True
         ):
-            near_m = np.where(mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8)))  # beside it, the surface's
+            near_m = np.where(
+                mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8))
+            )  # the surface's depth beside the silhouette
             pixels = np.argwhere(_ridge(direction, edge) & (near_m > 0))
-            if len(pixels) == 0:  # nothing is seen from there, as of a sheet from its side: the centre stands for it
+            if len(pixels) == 0:  # no edge from this viewpoint, as of a sheet from its side: use the centre
                 pixels, near_m = np.full((1, 2), VIEW_PX // 2), np.full_like(near_m, T_cam_obj[2, 3])
             row, column = pixels[rng.choice(len(pixels), POINTS, replace=len(pixels) < POINTS)].T
-            seen = near_m[row, column].astype(np.float64)
-            p_cam_m = back_project(K, np.stack([column, row], axis=1) + 0.5, seen)
+            z_m = near_m[row, column].astype(np.float64)
+            p_cam_m = back_project(K, np.stack([column, row], axis=1) + 0.5, z_m)
             points.append((p_cam_m - T_cam_obj[:3, 3]) @ T_cam_obj[:3, :3])
             normals.append(direction[row, column] @ T_cam_obj[:2, :3])
-    return SparseViews(
+    return ViewpointModel(
         center_m=mesh.center_m,
         viewpoints=cKDTree(-z),
         points_m=np.stack(points).astype(np.float32),
@@ -106,8 +106,8 @@ def sparse_views(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> SparseViews
     )
 
 
-def _ridge(direction: Float[Array, "p p 2"], strength: Float[Array, "p p"]) -> Bool[Array, "p p"]:
-    """Where an edge is strongest across itself."""
+def _ridge(direction: Float[np.ndarray, "p p 2"], strength: Float[np.ndarray, "p p"]) -> Bool[np.ndarray, "p p"]:
+    """Edge pixels that are local maxima across the edge."""
     rows, columns = np.mgrid[: len(strength), : len(strength)].astype(np.float32)
     strength, x, y = (np.ascontiguousarray(v, np.float32) for v in (strength, direction[..., 0], direction[..., 1]))
     ahead = cv2.remap(strength, columns + x, rows + y, cv2.INTER_LINEAR)

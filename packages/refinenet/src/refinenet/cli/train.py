@@ -6,25 +6,25 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import click
 from posecore.command_line import progress_bar, stoppable
 
 from refinenet.cli.options import FILE, quiet_option, verbose_option
+from refinenet.config import DeviceName, LossName, PresetName
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
-
-PRESETS = ("paper", "compact", "plus", "flow")
-LOSSES = ("contour", "contour-forward", "mse", "point", "contour+point", "flow+point")
 
 log = logging.getLogger(__name__)
 
 
 @click.command()
 @click.argument("shards", type=str)
-@click.option("--preset", type=click.Choice(PRESETS), default="compact", help="Which network and how it is trained.")
+@click.option(
+    "--preset", type=click.Choice(get_args(PresetName)), default="compact", help="Which network and how it is trained."
+)
 @click.option("--config", "file", type=FILE, metavar="FILE", help="YAML laid over the preset.")
 @click.option(
     "--set", "overrides", multiple=True, metavar="KEY=VALUE",
@@ -35,11 +35,11 @@ log = logging.getLogger(__name__)
 )
 @click.option("--steps", type=click.IntRange(1), help="Optimiser steps. [preset]")
 @click.option("--batch", type=click.IntRange(1), help="Pairs in a batch, on each rank. [preset]")
-@click.option("--loss", type=click.Choice(LOSSES), help="Loss. [preset]")
+@click.option("--loss", type=click.Choice(get_args(LossName)), help="Loss. [preset]")
 @click.option("--seed", type=click.IntRange(0), help="Of weights, order, hypotheses, augmentation. [preset, 0]")
 @click.option("--workers", type=click.IntRange(0), help="Loader processes; 0 loads in the training process. [preset]")
 @click.option("--threads", type=click.IntRange(0), help="Torch threads; 0 leaves torch's choice. [preset, 0]")
-@click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]), help="Where the network runs. [preset, auto]")
+@click.option("--device", type=click.Choice(get_args(DeviceName)), help="Where the network runs. [preset, auto]")
 @click.option(
     "--backbone-weights", type=FILE, metavar="FILE", help="ImageNet weights of preset paper's stem (safetensors)."
 )
@@ -155,7 +155,7 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
                 bar.console.print(f"step {step}  {move}", highlight=False, soft_wrap=True)
             return
         loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss"))
-        wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_share']:.0f} %)"
+        wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_fraction']:.0f} %)"
         timing = f"{wait}, compute {values['compute_ms']:.0f} ms, {values['pairs_per_s']:.0f} pairs/s"
         bad = f"  {values['skipped_shards']:.0f} bad shards" if values["skipped_shards"] else ""
         bar.update(task, completed=step, state=f"{loss}  {timing}{bad}")

@@ -1,31 +1,32 @@
-"""Configuration of training: one frozen dataclass a section, presets as YAML, and how they are loaded."""
+"""Configuration of training: one frozen dataclass a section, presets as YAML, and their loading."""
 
+from refinenet.config.data import AugmentConfig, HypothesisConfig, LoaderConfig, ValidationConfig, WindowConfig
+from refinenet.config.load import load_config
+from refinenet.config.network import BackboneConfig, NetworkConfig
 from refinenet.config.train import (
-    PRESETS,
-    AugmentConfig,
-    BackboneConfig,
-    HypothesisConfig,
-    LoaderConfig,
+    ConfidenceTarget,
+    DeviceName,
     LossConfig,
-    NetworkConfig,
+    LossName,
+    OnPolicyConfig,
     OptimiserConfig,
-    OwnPredictionsConfig,
+    PresetName,
     TrainConfig,
-    ValidationConfig,
-    WindowConfig,
-    load_config,
 )
 
 __all__ = [
-    "PRESETS",
     "AugmentConfig",
     "BackboneConfig",
+    "ConfidenceTarget",
+    "DeviceName",
     "HypothesisConfig",
     "LoaderConfig",
     "LossConfig",
+    "LossName",
     "NetworkConfig",
+    "OnPolicyConfig",
     "OptimiserConfig",
-    "OwnPredictionsConfig",
+    "PresetName",
     "TrainConfig",
     "ValidationConfig",
     "WindowConfig",

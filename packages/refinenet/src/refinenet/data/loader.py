@@ -1,4 +1,4 @@
-"""The processes that load batches, and how batches come from them to the device."""
+"""Loader processes, and the transfer of their batches to the device."""
 
 import multiprocessing.util
 import os
@@ -16,15 +16,16 @@ from posecore.errors import PoseError
 from posecore.processes import interrupts_ignored
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from refinenet.data.pair_stream import Batch, PairStream
+from refinenet.batch import Batch
+from refinenet.data.pair_stream import PairStream
 from refinenet.errors import LoaderError
 
 SHARED_MEMORY = Path("/dev/shm")
-"""What batches come through from other processes."""
+"""Shared memory, through which loader processes hand over batches."""
 
 
 def prepare_worker(threads: int = 1) -> None:
-    """Keep a loader process to its own core: the software rasteriser, OpenCV and torch each start threads for all."""
+    """Limit a loader process to its own core: software rasteriser, OpenCV and torch each start a thread per core."""
     os.environ["LP_NUM_THREADS"] = str(threads)
     cv2.setNumThreads(threads)
     torch.set_num_threads(threads)
@@ -32,21 +33,21 @@ def prepare_worker(threads: int = 1) -> None:
 
 def _init_worker(_: int) -> None:
     prepare_worker()
-    # a thread that still hands over a batch when Python ends would abort the process, and the run with a traceback
+    # a thread that still hands over a batch at Python's exit would abort the process, and the run with a traceback
     multiprocessing.util.Finalize(None, os._exit, args=(0,), exitpriority=-100)
 
 
 def require_shared_memory(batch: Batch, in_flight: int) -> None:
-    """Refuse to go on where batches that wait to be used do not fit: torch would lose one, and wait for it for ever.
+    """Require shared memory for the batches in flight: torch would lose a batch and wait for it for ever.
 
     Raises:
-        LoaderError: It is too small; what is needed is said.
+        LoaderError: It is too small; the message gives the size needed.
     """
     if not SHARED_MEMORY.is_dir():
         return
-    tensors = (*batch.pair, *batch.target, batch.sample_ids, batch.visible_share, batch.render_colours)
+    tensors = (*batch.inputs, *batch.target, batch.sample_ids, batch.visible_fraction, batch.render_colours)
     needed = in_flight * sum(x.nbytes for x in tensors if x is not None)
-    size = shutil.disk_usage(SHARED_MEMORY).total  # what is free already lacks the batches of faster processes
+    size = shutil.disk_usage(SHARED_MEMORY).total  # free memory is already short of the batches of faster processes
     if size < needed:
         enough_gb = max(1, round(2 * needed / 1e9))
         raise LoaderError(
@@ -57,7 +58,7 @@ def require_shared_memory(batch: Batch, in_flight: int) -> None:
 
 
 class _InProcess(IterableDataset[Batch]):
-    """A stream in a loader process."""
+    """A stream, iterated in a loader process."""
 
     def __init__(self, stream: PairStream) -> None:
         super().__init__()
@@ -74,32 +75,32 @@ class _InProcess(IterableDataset[Batch]):
 
 
 @contextmanager
-def deaths_named() -> Iterator[None]:
-    """Name what torch raises when a loader process dies, wherever the program is then: it does so in a signal handler.
+def worker_failures() -> Iterator[None]:
+    """Turn the error that torch raises when a loader process dies, from a signal handler, into a `LoaderError`.
 
     Raises:
-        LoaderError: One did.
+        LoaderError: A loader process died.
     """
     try:
         yield
     except RuntimeError as error:
         if not str(error).startswith("DataLoader worker"):
             raise
-        raise _death(str(error).partition(". ")[0].rstrip(".").removeprefix("DataLoader worker ")) from error
+        raise _worker_failure(str(error).partition(". ")[0].rstrip(".").removeprefix("DataLoader worker ")) from error
 
 
-def _death(what: str) -> LoaderError:
-    """What to say of a process that died, after which torch's handler, which would raise again, is taken out."""
+def _worker_failure(reason: str) -> LoaderError:
+    """The error for a process that died; removes torch's signal handler, which would raise again."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     return LoaderError(
-        f"a loader process ended: {what}; where memory is short, fewer --workers or less loader.cache_mb need less, "
+        f"a loader process ended: {reason}; where memory is short, fewer --workers or less loader.cache_mb need less, "
         "where /dev/shm is, --shm-size makes it larger; --resume goes on from the last checkpoint, if there is one"
     )
 
 
 class _Loader(DataLoader[Batch]):
-    """A loader whose processes' errors arrive as they were raised, not wrapped with a traceback into the message."""
+    """A loader that raises the original errors of its processes, without torch's traceback in the message."""
 
     def __iter__(self) -> Any:
         try:
@@ -109,16 +110,16 @@ class _Loader(DataLoader[Batch]):
         except PoseError as error:
             *wrapped, last = str(error).strip().splitlines()
             raise (type(error)(last.partition(": ")[2]) if wrapped else error) from None
-        except (ConnectionError, EOFError) as error:  # from the pipe that a killed one leaves
-            raise _death("its pipe broke") from error
+        except (ConnectionError, EOFError) as error:  # from the pipe of a killed process
+            raise _worker_failure("its pipe broke") from error
 
 
 def make_loader(stream: PairStream, *, pin: bool = False) -> DataLoader[Batch]:
     """A loader of the stream's batches; processes are spawned, since a GL context does not survive a fork.
 
     Args:
-        stream: What to load.
-        pin: Put batches into page-locked memory, from where a GPU copies them while it computes.
+        stream: Stream of batches.
+        pin: Put batches into page-locked memory, from which a GPU copies them while it computes.
     """
     loader = stream.config.loader
     if loader.workers == 0:
@@ -135,7 +136,7 @@ def make_loader(stream: PairStream, *, pin: bool = False) -> DataLoader[Batch]:
 
 
 def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]:
-    """Batches on a device; to a GPU they are copied beside the step before, which is still being computed."""
+    """Batches on a device; a GPU copies each while it still computes the previous step."""
     if device.type != "cuda":
         yield from (batch.to(device) for batch in batches)
         return
@@ -145,7 +146,7 @@ def on_device(batches: Iterator[Batch], device: torch.device) -> Iterator[Batch]
             there = batch.to(device)
         main = torch.cuda.current_stream(device)
         main.wait_stream(side)
-        for tensor in (*there.pair, *there.target):
+        for tensor in (*there.inputs, *there.target):
             if tensor is not None:
-                tensor.record_stream(main)  # its memory was taken on the other stream and must not be reused too early
+                tensor.record_stream(main)  # allocated on the other stream: its memory must not be reused too early
         yield there

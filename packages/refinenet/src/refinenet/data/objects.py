@@ -1,4 +1,4 @@
-"""A dataset's objects: meshes for the rasteriser, points and symmetries for the point loss and the metrics."""
+"""Objects of a dataset: meshes for the rasteriser, points and symmetries for the point loss and the metrics."""
 
 import tempfile
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ def object_ids(reader: ShardReader) -> list[int]:
 
 
 def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:
-    """Meshes to draw hypotheses with in training: a face for each pixel of a patch, where there are more."""
+    """Meshes for rendering hypotheses in training, simplified to one face for each pixel of a patch."""
     return {obj_id: simplified(mesh, patch_px**2) for obj_id, mesh in meshes.items()}
 
 
@@ -46,19 +46,20 @@ def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
 def symmetries_of(
     meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], step_deg: float
 ) -> dict[int, np.ndarray]:
-    """(s, 4, 4) transforms that leave each object as it is, the identity first, by object id.
+    """(s, 4, 4) symmetry transforms of each object, the identity first, by object id.
 
     Args:
         meshes: By object id.
-        models: Symmetries by object id; an object that is not there has none.
+        models: Symmetries by object id; an object without an entry has none.
         step_deg: Step at which continuous symmetries are sampled.
     """
-    found = {}
+    transforms = {}
     for obj_id in meshes:
-        known = models.get(obj_id)
-        identity = np.eye(4)[None]
-        found[obj_id] = identity if known is None else symmetry_transforms(known, max_step_rad=np.deg2rad(step_deg))
-    return found
+        model, identity = models.get(obj_id), np.eye(4)[None]
+        transforms[obj_id] = (
+            identity if model is None else symmetry_transforms(model, max_step_rad=np.deg2rad(step_deg))
+        )
+    return transforms
 
 
 def object_points(
@@ -68,7 +69,7 @@ def object_points(
 
     Args:
         meshes: By object id; rows follow the sorted ids.
-        models: Symmetries by object id; an object that is not there has none.
+        models: Symmetries by object id; an object without an entry has none.
         n_points: Points of each object.
         step_deg: Step at which continuous symmetries are sampled.
     """
@@ -77,22 +78,22 @@ def object_points(
     width = max(len(S) for S in transforms)
     padded = [np.concatenate([S, np.tile(np.eye(4), (width - len(S), 1, 1))]) for S in transforms]
     valid = np.stack([np.arange(width) < len(S) for S in transforms])
-    turning = [axes_of(models.get(obj_id)) for obj_id in sorted(meshes)]
-    most = max(len(axes) for axes, _ in turning)
-    axes = np.stack([np.concatenate([own, np.zeros((most - len(own), 3))]) for own, _ in turning])
+    continuous = [axes_of(models.get(obj_id)) for obj_id in sorted(meshes)]
+    most = max(len(axes) for axes, _ in continuous)
+    axes = np.stack([np.concatenate([axes, np.zeros((most - len(axes), 3))]) for axes, _ in continuous])
     return ObjectPoints(
         torch.from_numpy(np.stack(points).astype(np.float32)),
         torch.from_numpy(np.stack(padded).astype(np.float32)),
         torch.from_numpy(valid),
         torch.from_numpy(axes.astype(np.float32)),
-        torch.from_numpy(np.stack([point for _, point in turning]).astype(np.float32)),
+        torch.from_numpy(np.stack([point for _, point in continuous]).astype(np.float32)),
     )
 
 
 def axes_of(model: ModelInfo | None) -> tuple[Float[np.ndarray, "a 3"], Float[np.ndarray, "3"]]:
-    """Unit axes about which any turn leaves an object as it is, and a point (metres) on all of them; object frame.
+    """Unit axes of an object's continuous symmetries, and a point (metres) on all axes; object frame.
 
-    None, one, or the three of a ball.
+    No axis, one axis, or the three axes of a ball.
     """
     if model is None or not model.symmetries_continuous:
         return np.zeros((0, 3)), np.zeros(3)
@@ -104,7 +105,7 @@ def axes_of(model: ModelInfo | None) -> tuple[Float[np.ndarray, "a 3"], Float[np
 
 
 def farthest_points(vertices_m: np.ndarray, n: int) -> np.ndarray:
-    """(n, 3) vertices, each the farthest from those before; repeats where the mesh has fewer."""
+    """(n, 3) vertices by farthest-point sampling; repeated where the mesh has fewer."""
     chosen = [int(np.argmax(np.linalg.norm(vertices_m - vertices_m.mean(axis=0), axis=1)))]
     distance = np.full(len(vertices_m), np.inf)
     for _ in range(n - 1):

@@ -1,8 +1,9 @@
-"""Pairs made in the training loop: a new hypothesis for a stored scene, rendered, with the scene cut anew to match.
+"""Online pairs: a new hypothesis for a stored scene, rendered, with an online crop of the scene to match.
 
-A shard stores the scene with one window. Here the scene is turned about the optical axis with its truth, a hypothesis
-is drawn near it, and the window that inference would cut for that hypothesis is resampled from the stored patch: one
-affine warp, because turning the camera about its optical axis and moving the window are both affine in the image.
+A shard stores the scene with one window. Here the scene is rotated about the optical axis with its ground truth, a
+hypothesis is drawn nearby, and the window that inference would cut for that hypothesis is resampled from the stored
+patch: one affine warp, because rotating the camera about its optical axis and moving the window are both affine in the
+image.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,22 +21,21 @@ from posecore.window import Window
 
 from refinenet.config import AugmentConfig, HypothesisConfig, WindowConfig
 from refinenet.image import augmentation
-from refinenet.image.crops import hypothesis_window, optical_axis_turn, recut_affine, warp
-from refinenet.image.masks import visible_overlap, visible_share
+from refinenet.image.crops import crop_affine, hypothesis_window, optical_axis_rotation, warp
+from refinenet.image.masks import visible_fraction, visible_mask_iou
 
 Array = np.ndarray
 MIN_CONTOUR_PX = 12
-"""A contour of fewer pixels says nothing about a pose; the hypothesis is drawn again, nearer."""
+"""Smallest contour from which a pose can be estimated; below, the hypothesis is drawn again, nearer."""
 
 ATTEMPTS = 4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PairArrays:
-    """One batch of pairs, every label in its patch's pixels; see `loss.Target` for the fields' meaning.
+    """One batch of pairs, every label in its patch's pixels; see `LossTarget` for the fields' meaning.
 
-    `kept` names the input samples the rows came from: one whose object cannot be seen in any window is left out and
-    another stands in its place.
+    `kept` are the input samples of the rows: a sample whose object is not visible is replaced by another.
     """
 
     scene_rgb: UInt8[Array, "b p p 3"]
@@ -49,15 +49,15 @@ class PairArrays:
     hypothesis_distance_px: Float[Array, "b p p"]
     hypothesis_depth_m: Float[Array, "b p p"] | None
     scene_bits: UInt8[Array, "b p p"]
-    overlap: Float[Array, " b"] | None
+    visible_iou: Float[Array, " b"] | None
     render_colours: Float[Array, "b 3 3"]
     obj_id: Array
     kept: Array
 
     @property
-    def visible_share(self) -> Float[Array, " b"]:
-        """How much of each object is visible in its patch, after augmentation."""
-        return visible_share(self.scene_bits)
+    def visible_fraction(self) -> Float[Array, " b"]:
+        """Visible fraction of each object in its patch, after augmentation."""
+        return visible_fraction(self.scene_bits)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,7 +69,7 @@ class _Draft:
     T_cam_obj: Float[Array, "4 4"]
     T_cam_obj_hypothesis: Float[Array, "4 4"]
     K_crop: Float[Array, "3 3"]
-    turn: Float[Array, "3 3"]
+    rotation: Float[Array, "3 3"]
     patch_from_stored: Float[Array, "2 3"]
     scene_distance_px: Float[Array, "p p"]
     scene_bits: UInt8[Array, "p p"]
@@ -83,40 +83,40 @@ def draw_hypothesis(
     rng: np.random.Generator,
     reach: float = 1,
 ) -> Float[Array, "4 4"]:
-    """A pose near the truth: angle and distance uniform up to the configured ends, axis and direction uniform.
+    """A pose near the ground truth: angle and distance uniform up to their limits, axis and direction uniform.
 
-    The part of the move along the ray from the camera to the object's origin is then scaled by `depth_stretch`.
+    The translation along the ray from the camera to the object's origin is then scaled by `depth_stretch`.
 
-    Either may be scaled down alone: after one update a pose is well placed in the image and still turned, so that is
-    what the later iterations of a refinement see.
+    Angle and distance are scaled down independently: after one update, a pose is well positioned in the image and still
+    rotated, which is the input of a refinement's later iterations.
 
     Args:
-        T_cam_obj: Truth.
-        diameter_m: Of the object.
-        config: Ends of the ranges.
+        T_cam_obj: Ground truth.
+        diameter_m: Object diameter.
+        config: Limits.
         rng: Source of every draw.
-        reach: Factor on both ends.
+        reach: Factor on both limits.
     """
-    turn, move = (rng.random() if rng.random() < config.easy_share else 1.0 for _ in range(2))
-    angle_rad = np.deg2rad(config.max_angle_deg) * reach * turn * rng.random()
-    distance_m = config.max_translation_diameter * diameter_m * reach * move * rng.random()
+    angle_scale, distance_scale = (rng.random() if rng.random() < config.easy_fraction else 1.0 for _ in range(2))
+    angle_rad = np.deg2rad(config.max_angle_deg) * reach * angle_scale * rng.random()
+    distance_m = config.max_translation_diameter * diameter_m * reach * distance_scale * rng.random()
     drawn = se3.perturb(T_cam_obj, float(angle_rad), float(distance_m), rng)
     return drawn if config.depth_stretch == 1 else se3.stretched_along_ray(T_cam_obj, drawn, config.depth_stretch)
 
 
-class PairMaker:
-    """Makes batches of pairs with windows of their own out of stored scenes.
+class OnlinePairMaker:
+    """Maker of batches of online pairs from stored scenes.
 
     Args:
         meshes: By object id.
-        rasteriser: Draws them; made in the process that uses it.
+        rasteriser: Rasteriser with these meshes; made in the process that uses it.
         patch_px: Side of the new patches.
-        window: How windows are cut.
+        window: Crop window.
         fixed_sides_px: Side of each object's window in the full image, for windows of fixed side.
         contour_points: Contour points of each patch.
-        hypothesis: How hypotheses are drawn; with `fresh` off the stored ones are taken, else by `stored_share`.
-        augment_config: Colour augmentation.
-        symmetries: Transforms of each object that leave it as it is, for `hypothesis.any_twin`.
+        hypothesis: Range of hypotheses; without `online` all are precomputed.
+        augment_config: Image augmentation.
+        symmetries: Symmetry transforms of each object, for `hypothesis.sample_symmetries`.
     """
 
     def __init__(
@@ -143,77 +143,77 @@ class PairMaker:
         self._symmetries = dict(symmetries or {})
 
     def __call__(self, samples: Sequence[Mapping[str, Any]], rngs: Sequence[np.random.Generator]) -> PairArrays | None:
-        """Pairs of these samples, each drawn with its own generator; None when no object can be seen in any of them.
+        """Pairs of these samples, each drawn with its own generator; None when no object is visible.
 
         Args:
             samples: Rows of a shard: scene_rgb, scene_mask, scene_contour_cam_m, T_cam_obj, K, window_px, obj_id and,
-                where it is to be taken, T_cam_obj_hypothesis.
+                where precomputed ones are used, T_cam_obj_hypothesis.
             rngs: As many.
         """
         drafts = [d for i, (s, rng) in enumerate(zip(samples, rngs, strict=True)) if (d := self._draft(i, s, rng))]
         if not drafts:
             return None
         K_crop = np.stack([d.K_crop for d in drafts])
-        guesses = np.stack([d.T_cam_obj_hypothesis for d in drafts])
+        hypotheses = np.stack([d.T_cam_obj_hypothesis for d in drafts])
         obj_ids = np.array([int(d.sample["obj_id"]) for d in drafts])
-        layers = self._rasteriser.render(obj_ids, K_crop, guesses, self._patch_px, self._patch_px)
+        layers = self._rasteriser.render(obj_ids, K_crop, hypotheses, self._patch_px, self._patch_px)
         rgb, depth = layers.rgb, layers.depth_m
         assert rgb is not None
         masks = [contour.contour_mask(d > 0) for d in depth]
-        seen = [i for i, mask in enumerate(masks) if mask.sum() >= MIN_CONTOUR_PX]
-        if not seen:
+        visible = [i for i, mask in enumerate(masks) if mask.sum() >= MIN_CONTOUR_PX]
+        if not visible:
             return None
-        seen += [seen[i % len(seen)] for i in range(len(samples) - len(seen))]
-        drafts = [drafts[i] for i in seen]
+        visible += [visible[i % len(visible)] for i in range(len(samples) - len(visible))]
+        drafts = [drafts[i] for i in visible]
         scenes, bits = zip(*(self._scene(d, samples, rngs[d.index]) for d in drafts), strict=True)
         scene_bits = np.stack(bits)
         scene_rgb, hypothesis_rgb, render_colours = augmentation.colour(
-            np.stack(scenes), rgb[seen], self._augment, rngs[drafts[0].index]
+            np.stack(scenes), rgb[visible], self._augment, rngs[drafts[0].index]
         )
         points = [
             contour.sample_contour(depth[i] > 0, depth[i], d.K_crop, self._contour_points, rngs[d.index])
-            for i, d in zip(seen, drafts, strict=True)
+            for i, d in zip(visible, drafts, strict=True)
         ]
         return PairArrays(
             scene_rgb=scene_rgb,
             hypothesis_rgb=hypothesis_rgb,
             T_cam_obj=np.stack([d.T_cam_obj for d in drafts]),
-            T_cam_obj_hypothesis=guesses[seen],
-            K_crop=K_crop[seen],
+            T_cam_obj_hypothesis=hypotheses[visible],
+            K_crop=K_crop[visible],
             scene_contour_m=np.stack([self._scene_points(d) for d in drafts]),
             hypothesis_contour_m=np.stack(points),
             scene_distance_px=np.stack([d.scene_distance_px for d in drafts]),
-            hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in seen]),
-            hypothesis_depth_m=depth[seen],
+            hypothesis_distance_px=np.stack([contour.distance_transform_px(masks[i]) for i in visible]),
+            hypothesis_depth_m=depth[visible],
             scene_bits=scene_bits,
-            overlap=visible_overlap(depth[seen] > 0, scene_bits),
+            visible_iou=visible_mask_iou(depth[visible] > 0, scene_bits),
             render_colours=render_colours,
-            obj_id=obj_ids[seen],
+            obj_id=obj_ids[visible],
             kept=np.array([d.index for d in drafts]),
         )
 
     def _draft(self, index: int, sample: Mapping[str, Any], rng: np.random.Generator) -> _Draft | None:
-        """Pose, window and scene labels of one pair; None when the scene's contour cannot be seen in any window."""
+        """Pose, window and scene labels of a pair; None when no window shows the scene's contour."""
         mesh = self._meshes[int(sample["obj_id"])]
-        in_plane = self._hypothesis.fresh and self._hypothesis.in_plane
-        turn = optical_axis_turn(rng.uniform(-np.pi, np.pi) if in_plane else 0.0)
-        T_turn = se3.make_T(turn, np.zeros(3))
-        truth = T_turn @ sample["T_cam_obj"]
+        in_plane = self._hypothesis.online and self._hypothesis.in_plane
+        rotation = optical_axis_rotation(rng.uniform(-np.pi, np.pi) if in_plane else 0.0)
+        T_rotation = se3.make_T(rotation, np.zeros(3))
+        T_gt = T_rotation @ sample["T_cam_obj"]
         x0, y0, side = (float(v) for v in sample["window_px"])
         stored, stored_px = Window(x0_px=x0, y0_px=y0, side_px=side), len(sample["scene_rgb"])
-        share = self._hypothesis.stored_share
-        stored_first = not self._hypothesis.fresh or (share > 0 and rng.random() < share)
+        fraction = self._hypothesis.precomputed_fraction
+        precomputed = not self._hypothesis.online or (fraction > 0 and rng.random() < fraction)
         for attempt in range(ATTEMPTS):
-            if self._hypothesis.fresh and not (stored_first and attempt == 0):
-                around = self._twin(truth, int(sample["obj_id"]), rng) if self._hypothesis.any_twin else truth
-                guess = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
+            if self._hypothesis.online and not (precomputed and attempt == 0):
+                around = self._equivalent(T_gt, int(sample["obj_id"]), rng)
+                hypothesis = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
             else:
-                guess = T_turn @ sample["T_cam_obj_hypothesis"]
-            if (guess[:3, :3] @ mesh.center_m + guess[:3, 3])[2] < mesh.diameter_m:
+                hypothesis = T_rotation @ sample["T_cam_obj_hypothesis"]
+            if (hypothesis[:3, :3] @ mesh.center_m + hypothesis[:3, 3])[2] < mesh.diameter_m:
                 continue
             fixed_px = self._fixed_sides_px.get(int(sample["obj_id"]), stored.side_px)
-            window = hypothesis_window(self._window, sample["K"], guess, mesh, fixed_px)
-            affine = recut_affine(stored, stored_px, sample["K"], turn, window, self._patch_px)
+            window = hypothesis_window(self._window, sample["K"], hypothesis, mesh, fixed_px)
+            affine = crop_affine(stored, stored_px, sample["K"], rotation, window, self._patch_px)
             bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
             valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
             # Where the stored patch ends the silhouette is cut, which is no contour: outside counts as object.
@@ -222,10 +222,10 @@ class PairMaker:
                 return _Draft(
                     index=index,
                     sample=sample,
-                    T_cam_obj=truth,
-                    T_cam_obj_hypothesis=guess,
+                    T_cam_obj=T_gt,
+                    T_cam_obj_hypothesis=hypothesis,
                     K_crop=crop_K(sample["K"], window, self._patch_px),
-                    turn=turn,
+                    rotation=rotation,
                     patch_from_stored=affine,
                     scene_distance_px=contour.distance_transform_px(outline),
                     scene_bits=bits,
@@ -233,32 +233,32 @@ class PairMaker:
                 )
         return None
 
-    def _twin(self, truth: Float[Array, "4 4"], obj_id: int, rng: np.random.Generator) -> Float[Array, "4 4"]:
-        """One of the poses that look like the truth."""
-        transforms = self._symmetries.get(obj_id)
-        return truth if transforms is None else np.asarray(truth @ transforms[rng.integers(len(transforms))])
+    def _equivalent(self, T_gt: Float[Array, "4 4"], obj_id: int, rng: np.random.Generator) -> Float[Array, "4 4"]:
+        """A random symmetry-equivalent ground truth under `sample_symmetries`, else the ground truth itself."""
+        transforms = self._symmetries.get(obj_id) if self._hypothesis.sample_symmetries else None
+        return T_gt if transforms is None else np.asarray(T_gt @ transforms[rng.integers(len(transforms))])
 
     def _scene(
         self, draft: _Draft, samples: Sequence[Mapping[str, Any]], rng: np.random.Generator
     ) -> tuple[UInt8[Array, "p p 3"], UInt8[Array, "p p"]]:
-        """Scene patch and its masks, with background and occluders exchanged."""
+        """Scene patch and its masks, with background and occluders replaced."""
         scene, bits = warp(draft.sample["scene_rgb"], draft.patch_from_stored, self._patch_px), draft.scene_bits
         exchange = rng.random() < self._augment.background
         if exchange or not draft.valid.all():
             other = samples[int(rng.integers(len(samples)))]
             foreground = (other["scene_mask"] & BIT_FOREGROUND) > 0
-            behind = augmentation.backdrop(other["scene_rgb"], foreground, self._patch_px, rng)
+            behind = augmentation.background_patch(other["scene_rgb"], foreground, self._patch_px, rng)
             keep = draft.valid & ((bits & BIT_FOREGROUND) > 0) if exchange else draft.valid
-            # The stored window's edge must not show: centred near the truth, it would give the answer away.
+            # The stored window's edge must not show: it is centred near the ground truth and would reveal it.
             scene = np.where(keep[..., None], scene, behind)
         if self._augment.occlusion and rng.random() < self._augment.occlusion:
             other = samples[int(rng.integers(len(samples)))]
             scene, bits = augmentation.occlude(
-                scene, bits, other["scene_rgb"], other["scene_mask"], self._augment.occlusion_leaves, rng
+                scene, bits, other["scene_rgb"], other["scene_mask"], self._augment.min_visible_fraction, rng
             )
         return scene, bits
 
     def _scene_points(self, draft: _Draft) -> Float[Array, "n 3"]:
         points = draft.sample["scene_contour_cam_m"]
         chosen = (np.arange(self._contour_points) * len(points)) // self._contour_points
-        return np.asarray(points[chosen] @ draft.turn.T.astype(points.dtype))
+        return np.asarray(points[chosen] @ draft.rotation.T.astype(points.dtype))

@@ -1,113 +1,85 @@
 """Streaming of shards: whole shards in shuffled order, samples shuffled within a group of shards, batches of tensors.
 
-Which sample comes when is a pure function of (seed, epoch, rank, worker), worked out before anything is read. So a
-run resumes in the middle of an epoch by arithmetic, and a pair's pose does not depend on the number of workers.
+The order of samples is a pure function of (seed, epoch, rank, worker), computed before anything is read: a run resumes
+in the middle of an epoch by arithmetic, and a pair's pose does not depend on the number of workers.
 """
 
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
 from posecore.errors import ConfigError, ShardError
 from posecore.raster import Rasteriser
 from posecore.shard import ShardReader, load_meshes
 from torch import Tensor
 from torch.utils.data import IterableDataset, get_worker_info
 
+from refinenet.batch import Batch, LossTarget, NetworkInput
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
-from refinenet.data.growing_split import Growth
+from refinenet.data.growing_split import GrowingSplit
 from refinenet.data.objects import for_patches, load_models, symmetries_of
-from refinenet.data.online_pairs import PairArrays, PairMaker
+from refinenet.data.online_pairs import OnlinePairMaker, PairArrays
+from refinenet.data.precomputed_pairs import PRECOMPUTED_FIELDS, precomputed_pairs
 from refinenet.data.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
-from refinenet.data.stored_pairs import STORED_FIELDS, stored_pairs
 from refinenet.image.crops import fixed_sides_px
-from refinenet.models.networks import Pair
-from refinenet.training.losses import Target
 
 Array = np.ndarray
-RECUT_FIELDS = (
+ONLINE_FIELDS = (
     "scene_rgb", "scene_mask", "scene_contour_cam_m", "T_cam_obj", "T_cam_obj_hypothesis", "K", "window_px", "obj_id",
 )  # fmt: skip
 
 
-class Batch(NamedTuple):
-    """What a step consumes.
-
-    Attributes:
-        pair: What the network sees.
-        target: What the loss compares its update with.
-        sample_ids: (b, 2) shard and row of every pair.
-        skipped: What is wrong with shards that others stand in for, each told once by the process that met it.
-        visible_share: How much of each object is visible in its patch.
-        render_colours: What augmentation did to the colours of each render; stays on the processor.
-    """
-
-    pair: Pair
-    target: Target
-    sample_ids: Int[Tensor, "b 2"]
-    skipped: tuple[str, ...] = ()
-    visible_share: Float[Tensor, " b"] | None = None
-    render_colours: Float[Tensor, "b 3 3"] | None = None
-
-    def to(self, device: torch.device) -> "Batch":
-        """The same on another device; copies from pinned memory are only queued."""
-        pair = self.pair.mapped(lambda x: x.to(device, non_blocking=True))
-        target = self.target.mapped(lambda x: x.to(device, non_blocking=True))
-        return self._replace(pair=pair, target=target)
-
-
 class PairSource:
-    """Turns rows of shards into batches of tensors; opened in the process that uses it."""
+    """Source of batches of tensors from rows of shards; opened in the process that uses it."""
 
     def __init__(self, url: str, config: TrainConfig, *, training: bool) -> None:
         self.reader = ShardReader(url)
         self._config = config
         if config.window.kind == "fixed" and self.reader.card.get("windows", "fixed") != "fixed":
             raise ConfigError(
-                f"{url}: windows are not of one side for all poses of an object, which preset {config.preset} looks "
-                "through; cut pairs with --set window=fixed, and merge only datasets with the same ones"
+                f"{url}: windows differ in side between poses of an object, preset {config.preset} expects fixed ones; "
+                "cut pairs with --set window=fixed, and merge only datasets with the same windows"
             )
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()
-        self._cache_mb = config.loader.cache_mb if training else 0  # what is measured is read once
+        self._cache_mb = config.loader.cache_mb if training else 0  # validation reads each shard once
         self._cache: dict[int, dict[str, Array]] = {}
         self._bad: dict[int, str] = {}
-        self._untold: list[str] = []
+        self._unreported: list[str] = []
         self._rasteriser: Rasteriser | None = None
-        if config.recut:
+        if config.makes_pairs_online:
             meshes = load_meshes(self.reader)
             self._rasteriser = Rasteriser(for_patches(meshes, config.network.patch_px))
-            self._make = PairMaker(
+            self._make = OnlinePairMaker(
                 meshes=meshes,
                 rasteriser=self._rasteriser,
                 patch_px=config.network.patch_px,
                 window=config.window,
                 fixed_sides_px=fixed_sides_px(self.reader.card["objects"]) if config.window.kind == "fixed" else None,
                 contour_points=config.loss.contour_points,
-                hypothesis=config.hypothesis if training else _steady(config),
+                hypothesis=config.hypothesis if training else _validation_hypotheses(config),
                 augment_config=self._augment,
                 symmetries=symmetries_of(meshes, load_models(self.reader), config.loss.symmetry_step_deg),
             )
 
     def close(self) -> None:
-        """Free what the rasteriser holds."""
+        """Free the rasteriser."""
         if self._rasteriser is not None:
             self._rasteriser.close()
 
     def load(self, shards: Sequence[int]) -> dict[int, dict[str, Array]]:
         """Read whole shards, only the fields that are used.
 
-        One that cannot be read is left out under `loader.skip_bad_shards`, and told with the next batch.
+        With `loader.skip_bad_shards`, unreadable shards are left out, and reported with the next batch.
 
         Raises:
-            ShardError: One cannot be read, without that setting.
+            ShardError: A shard cannot be read, without that setting.
         """
-        fields: tuple[str, ...] = RECUT_FIELDS if self._rasteriser is not None else STORED_FIELDS
-        if self._rasteriser is None and (self._config.network.confidence or self._config.network.sees_depth):
+        fields: tuple[str, ...] = ONLINE_FIELDS if self._rasteriser is not None else PRECOMPUTED_FIELDS
+        if self._rasteriser is None and (self._config.network.confidence or self._config.network.uses_depth):
             fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:
             self.reader.refresh()
@@ -120,43 +92,43 @@ class PairSource:
                     raise
                 if shard not in self._bad:
                     self._bad[shard] = str(error)
-                    self._untold.append(str(error))
+                    self._unreported.append(str(error))
         room = self._cache_mb * 2**20 - sum(map(_bytes, self._cache.values()))
         for shard, arrays in read.items():
-            # What is in stays in: replacing the oldest would miss every time when an epoch does not fit.
+            # Cached shards stay: replacing the oldest would miss every time when an epoch does not fit.
             if shard not in self._cache and _bytes(arrays) <= room:
                 self._cache[shard] = arrays
                 room -= _bytes(arrays)
         return read
 
     def batch(self, keys: Sequence[tuple[int, int, int]], samples: Sequence[dict[str, Any]]) -> Batch | None:
-        """Pairs of these samples; None when no object can be seen in any.
+        """Pairs of these samples; None when no object is visible.
 
         Args:
-            keys: (epoch, shard, row) of each, which seed its draws.
+            keys: (epoch, shard, row) of each sample, the seed of its draws.
             samples: As many rows.
         """
         rngs = [np.random.default_rng([self._config.seed, SAMPLE, *key]) for key in keys]
         if self._rasteriser is None:
-            arrays: PairArrays | None = stored_pairs(samples, rngs, self._config, self._augment, self.reader.url)
+            arrays: PairArrays | None = precomputed_pairs(samples, rngs, self._config, self._augment, self.reader.url)
         else:
             arrays = self._make(samples, rngs)
         if arrays is None:
             return None
-        if not self._config.network.sees_depth:
+        if not self._config.network.uses_depth:
             arrays = replace(arrays, hypothesis_depth_m=None)
         batch = _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
-        told, self._untold = tuple(self._untold), []
-        return batch._replace(skipped=told)
+        skipped, self._unreported = tuple(self._unreported), []
+        return batch._replace(skipped=skipped)
 
 
 def _bytes(arrays: dict[str, Array]) -> int:
     return sum(values.nbytes for values in arrays.values())
 
 
-def _steady(config: TrainConfig) -> HypothesisConfig:
-    """Hypotheses for validation: over the whole range, none of the stored ones beside them, scenes as they are."""
-    return replace(config.hypothesis, easy_share=0.0, stored_share=0.0, in_plane=False)
+def _validation_hypotheses(config: TrainConfig) -> HypothesisConfig:
+    """Hypotheses for validation: over the whole range, all drawn online, without rotation of the scene."""
+    return replace(config.hypothesis, easy_fraction=0.0, precomputed_fraction=0.0, in_plane=False)
 
 
 def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: dict[int, int]) -> Batch:
@@ -166,10 +138,10 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
     def real(values: Array) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
-    start, K_crop = real(arrays.T_cam_obj_hypothesis), real(arrays.K_crop)
-    target = Target(
+    hypothesis, K_crop = real(arrays.T_cam_obj_hypothesis), real(arrays.K_crop)
+    target = LossTarget(
         T_cam_obj=real(arrays.T_cam_obj),
-        T_cam_obj_hypothesis=start,
+        T_cam_obj_hypothesis=hypothesis,
         K_crop=K_crop,
         scene_contour_m=real(arrays.scene_contour_m),
         hypothesis_contour_m=real(arrays.hypothesis_contour_m),
@@ -177,13 +149,13 @@ def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: d
         hypothesis_distance_px=real(arrays.hypothesis_distance_px),
         object_index=torch.tensor([object_index[int(i)] for i in arrays.obj_id]),
         scene_bits=torch.from_numpy(np.ascontiguousarray(arrays.scene_bits)),
-        overlap=None if arrays.overlap is None else real(arrays.overlap),
+        visible_iou=None if arrays.visible_iou is None else real(arrays.visible_iou),
     )
     depth_m = None if arrays.hypothesis_depth_m is None else real(arrays.hypothesis_depth_m)
-    pair = Pair(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), start, K_crop, depth_m)
+    inputs = NetworkInput(image(arrays.scene_rgb), image(arrays.hypothesis_rgb), hypothesis, K_crop, depth_m)
     return Batch(
-        pair, target, torch.tensor(np.array(ids, np.int64)),
-        visible_share=real(arrays.visible_share), render_colours=real(arrays.render_colours),
+        inputs, target, torch.tensor(np.array(ids, np.int64)),
+        visible_fraction=real(arrays.visible_fraction), render_colours=real(arrays.render_colours),
     )  # fmt: skip
 
 
@@ -193,13 +165,13 @@ class PairStream(IterableDataset[Batch]):
 
     Attributes:
         url: Dataset.
-        config: Decides seed, batch, shuffling and how pairs are made.
+        config: Configuration: seed, batch, shuffling, pairs.
         split: Rows to train on.
-        rank: This process among `world`; ranks and workers take disjoint shards within an epoch.
+        rank: Index of this process; ranks and workers take disjoint shards within an epoch.
         world: Number of training processes.
         workers: Number of loader streams of each rank, at least 1.
         start: Batches of this rank that were consumed before.
-        growth: Adds shards of a growing dataset between epochs.
+        growing: Source of new shards between epochs; None for a complete dataset.
     """
 
     url: str
@@ -209,7 +181,7 @@ class PairStream(IterableDataset[Batch]):
     world: int = 1
     workers: int = 1
     start: int = 0
-    growth: Growth | None = None
+    growing: GrowingSplit | None = None
 
     def __post_init__(self) -> None:
         slots = self.world * self.workers
@@ -222,14 +194,14 @@ class PairStream(IterableDataset[Batch]):
     def _epochs(self) -> Iterator[tuple[int, dict[int, Array]]]:
         """Number and rows by shard of every epoch."""
         rows = dict(self.split.rows)
-        growth = iter(()) if self.growth is None else self.growth.epochs(self.url)
+        joining = iter(()) if self.growing is None else self.growing.epochs(self.url)
         for epoch in itertools.count():
             if epoch > 0:
-                rows |= next(growth, {})
+                rows |= next(joining, {})
             yield epoch, rows
 
     def groups(self, slot: int) -> Iterator[list[tuple[int, int, int]]]:
-        """Shuffled groups of (epoch, shard, row) of one of `world * workers` slots, without end."""
+        """Shuffled groups of (epoch, shard, row) for a slot among `world * workers`, without end."""
         seed, size = self.config.seed, self.config.loader.shuffle_shards
         for epoch, rows in self._epochs():
             order = np.random.default_rng([seed, ORDER, epoch]).permutation(sorted(rows))
@@ -240,10 +212,10 @@ class PairStream(IterableDataset[Batch]):
                 yield [keys[i] for i in shuffle]
 
     def __iter__(self) -> Iterator[Batch]:
-        """Batches of one worker; workers interleave, so worker k of w holds every w-th batch."""
+        """Batches of this worker; workers interleave: worker k among w makes every w-th batch."""
         info = get_worker_info()
         position = 0 if info is None else info.id
-        # After a resume the loader starts with its worker 0 again, which then stands in for the one whose turn it was.
+        # After a resume the loader starts with its worker 0 again, which then replaces the next worker in turn.
         worker = (position + self.start) % self.workers
         done = len(range(worker, self.start, self.workers))
         source = PairSource(self.url, self.config, training=True)
@@ -268,15 +240,17 @@ class PairStream(IterableDataset[Batch]):
                     batch = source.batch(keys, samples)
                     keys, samples = [], []
                     if batch is None:
-                        raise ShardError(f"{self.url}: no object can be seen in any of {self.config.batch} samples")
+                        raise ShardError(
+                            f"{self.url}: no object is visible in {self.config.batch} samples; render other poses"
+                        )
                     yield batch
 
     def _with_stand_ins(
         self, source: PairSource, group: list[tuple[int, int, int]], arrays: dict[int, dict[str, Array]]
     ) -> list[tuple[int, int, int]]:
-        """The group, with samples of the other shards in place of those of shards that could not be read.
+        """The group, with samples of readable shards in place of samples of unreadable shards.
 
-        Left out they would move every later batch, and a resumed run could not tell by arithmetic where it was.
+        Leaving these out would shift all later batches, and a run could not be resumed by arithmetic.
         """
         if all(shard in arrays for _, shard, _ in group):
             return group

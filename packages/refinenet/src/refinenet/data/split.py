@@ -1,6 +1,6 @@
-"""Which samples are trained on and which are held out, by scene.
+"""Split of a dataset into training and validation, by scene.
 
-A run fixes at its start which scenes are held out and which shards it begins with, in `data.json`.
+A run fixes at its start, in `data.json`, which scenes are for validation and which shards it begins with.
 """
 
 import itertools
@@ -15,24 +15,26 @@ from posecore.errors import CheckpointError, ShardError
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
 
-Array = np.ndarray
-ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, OWN = range(6)
+from refinenet.models.migration import migrated_record
+
+ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, ON_POLICY = range(6)
 """First key of each random stream, so that no two streams of a run share draws."""
 
 RECORD, GROWTH = "data.json", "growth"
-OTHER_OBJECT = -1  # in place of a scene, for samples of objects that are not trained on
+OTHER_OBJECT = -1
+"""Scene number of samples whose object is not trained on."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Split:
-    """Rows of every shard that belong to one side of the split by scene.
+    """Rows of every shard that belong to one side of the split.
 
     Attributes:
         rows: row numbers by shard; shards without a row are left out.
-        scenes: how many scenes.
+        scenes: number of scenes.
     """
 
-    rows: dict[int, Array]
+    rows: dict[int, np.ndarray]
     scenes: int
 
     @property
@@ -43,58 +45,58 @@ class Split:
 
 @dataclass(frozen=True, kw_only=True)
 class DataRecord:
-    """What a run fixed about its data when it started.
+    """Split that a run fixed when it started.
 
     Attributes:
         shards: shards that were there.
-        held_out: scenes that are measured on and never trained on.
+        validation_scenes: scenes that are never trained on.
     """
 
     shards: tuple[int, ...]
-    held_out: tuple[int, ...]
+    validation_scenes: tuple[int, ...]
 
     def save(self, out: Path) -> None:
-        """Write it into a run's folder, and drop what an earlier run left of a growing dataset.
+        """Write the record into a run's folder, and remove an earlier run's files of a growing dataset.
 
         Raises:
             StorageError: No rights or no space.
         """
         shutil.rmtree(out / GROWTH, ignore_errors=True)
-        text = json.dumps({"shards": self.shards, "held_out_scenes": self.held_out})
+        text = json.dumps({"shards": self.shards, "validation_scenes": self.validation_scenes})
         write_atomic(out / RECORD, text.encode())
 
     @classmethod
     def load(cls, out: Path) -> "DataRecord":
-        """Read it from a run's folder.
+        """Read the record from a run's folder.
 
         Raises:
             CheckpointError: It is missing or damaged.
         """
         try:
-            found = json.loads((out / RECORD).read_text())
-            return cls(shards=tuple(found["shards"]), held_out=tuple(found["held_out_scenes"]))
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            record = migrated_record(json.loads((out / RECORD).read_text()))
+            return cls(shards=tuple(record["shards"]), validation_scenes=tuple(record["validation_scenes"]))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise CheckpointError(
-                f"{out / RECORD}: missing or damaged ({type(error).__name__}), so nobody knows which scenes this run "
-                "held out; start a new run in another --out"
+                f"{out / RECORD}: missing or damaged ({type(error).__name__}), so the validation scenes of this run "
+                "are lost; start a new run in another --out"
             ) from error
 
 
 def read_scenes(
     reader: ShardReader, shards: Sequence[int], *, skip: bool = False, objects: Sequence[int] = ()
-) -> tuple[dict[int, Array], dict[int, str]]:
-    """Scene of every sample by shard, and what is wrong with the shards that cannot be read.
+) -> tuple[dict[int, np.ndarray], dict[int, str]]:
+    """Scene of every sample by shard, and the error of each shard that cannot be read.
 
-    Samples of other objects than those asked for have `OTHER_OBJECT`.
+    Samples of objects outside `objects` have scene `OTHER_OBJECT`.
 
     Args:
         reader: The dataset.
-        shards: Which shards.
-        skip: Whether to go on without shards that cannot be read.
+        shards: Shards to read.
+        skip: Continue without shards that cannot be read.
         objects: Ids to keep; empty keeps all.
 
     Raises:
-        ShardError: One cannot be read and `skip` is off.
+        ShardError: A shard cannot be read and `skip` is off.
     """
     scenes, bad = {}, {}
     for shard in shards:
@@ -110,60 +112,60 @@ def read_scenes(
     return scenes, bad
 
 
-def held_out_scenes(
-    url: str, scene_of: Mapping[int, Array], share: float, seed: int, *, growing: bool = False
-) -> Array:
-    """Scenes to hold out, at least one.
+def choose_validation_scenes(
+    url: str, scene_of: Mapping[int, np.ndarray], fraction: float, seed: int, *, growing: bool = False
+) -> np.ndarray:
+    """Scenes for validation, at least one.
 
     Args:
-        url: Of the dataset, for messages.
+        url: Dataset, for messages.
         scene_of: Scene of every sample by shard.
-        share: Of the scenes.
-        seed: Of the choice.
-        growing: Take those that `drawn_out` says, which does not ask for all scenes at once; where that leaves nothing
-            on one side, as of a complete dataset.
+        fraction: Fraction of the scenes.
+        seed: Seed of the choice.
+        growing: Use `draw_validation_scenes`, which needs no complete list of scenes, unless one side would be empty.
 
     Raises:
-        ShardError: No shard is there, or fewer than two scenes.
+        ShardError: There is no shard, or fewer than two scenes.
     """
     if not scene_of:
         raise ShardError(f"{url}: no finished shard; let `synthgen render` write one first, or wait with --follow")
     scenes = scenes_in(scene_of)
     if len(scenes) < 2:
         raise ShardError(
-            f"{url}: {len(scenes)} scene, expected at least 2 to hold one out; render more samples, or cut with a "
-            "smaller images_per_scene"
+            f"{url}: {len(scenes)} scene, expected at least 2 to keep one for validation; render more samples, or cut "
+            "with a smaller images_per_scene"
         )
-    if growing and 0 < len(drawn := drawn_out(scenes, share, seed)) < len(scenes):
+    if growing and 0 < len(drawn := draw_validation_scenes(scenes, fraction, seed)) < len(scenes):
         return drawn
-    held = max(1, min(len(scenes) - 1, round(share * len(scenes))))
-    return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:held])
+    count = max(1, min(len(scenes) - 1, round(fraction * len(scenes))))
+    return np.asarray(np.random.default_rng([seed, SPLIT]).permutation(scenes)[:count])
 
 
-def drawn_out(scenes: Array, share: float, seed: int) -> Array:
-    """Scenes of a growing dataset that are held out: each is drawn by itself, with probability `share`."""
+def draw_validation_scenes(scenes: np.ndarray, fraction: float, seed: int) -> np.ndarray:
+    """Validation scenes of a growing dataset: each is drawn independently, with probability `fraction`."""
     draws = [np.random.default_rng([seed, SPLIT, int(scene)]).random() for scene in scenes]
-    return np.asarray(scenes[np.array(draws) < share])
+    return np.asarray(scenes[np.array(draws) < fraction])
 
 
-def divide(scene_of: Mapping[int, Array], held_out: Sequence[int] | Array) -> tuple[Split, Split]:
+def divide(scene_of: Mapping[int, np.ndarray], validation_scenes: Sequence[int] | np.ndarray) -> tuple[Split, Split]:
     """Samples for training and for validation."""
-    held = np.isin(scenes_in(scene_of), held_out)
+    is_validation = np.isin(scenes_in(scene_of), validation_scenes)
 
-    def side(inside: bool) -> Split:
+    def side(validation: bool) -> Split:
         rows = {
-            s: np.flatnonzero((index != OTHER_OBJECT) & (np.isin(index, held_out) == inside))
+            s: np.flatnonzero((index != OTHER_OBJECT) & (np.isin(index, validation_scenes) == validation))
             for s, index in scene_of.items()
         }
-        return Split(rows={s: r for s, r in rows.items() if len(r)}, scenes=int((held == inside).sum()))
+        scenes = int((is_validation == validation).sum())
+        return Split(rows={s: r for s, r in rows.items() if len(r)}, scenes=scenes)
 
     return side(False), side(True)
 
 
-def scenes_in(scene_of: Mapping[int, Array]) -> Array:
-    """Numbers of the scenes that samples belong to."""
-    found = np.unique(np.concatenate([np.array([], np.int64), *scene_of.values()]))
-    return np.asarray(found[found != OTHER_OBJECT])
+def scenes_in(scene_of: Mapping[int, np.ndarray]) -> np.ndarray:
+    """Numbers of the scenes that samples belong to, sorted."""
+    scenes = np.unique(np.concatenate([np.array([], np.int64), *scene_of.values()]))
+    return np.asarray(scenes[scenes != OTHER_OBJECT])
 
 
 def spread_rows(split: Split, count: int) -> Split:

@@ -1,66 +1,68 @@
-"""Pairs of held-out scenes: made once and kept, so that the same are measured every time."""
+"""Validation pairs: made once and kept, so that every validation uses the same pairs."""
 
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
+import numpy as np
 from posecore.errors import ShardError
 
+from refinenet.batch import Batch
 from refinenet.config import TrainConfig
-from refinenet.data.growing_split import Growth
-from refinenet.data.pair_stream import Batch, PairSource
+from refinenet.data.growing_split import GrowingSplit
+from refinenet.data.pair_stream import PairSource
 from refinenet.data.split import Split, spread_rows
 
 
-class HeldOut:
-    """The pairs that a run is measured on, without a GL context of their own once they are made.
+class ValidationSet:
+    """Validation pairs of a run; once they are made, no GL context stays open.
 
-    Of a growing dataset more of them join, until there are as many as the configuration asks for.
+    More pairs of a growing dataset join, until there are as many as configured.
 
     Args:
         url: Shard dataset.
-        config: Of the run.
-        split: Held-out rows of the shards that the run began with.
-        growth: Knows which shards have joined since; None where none can.
-        joined: Those that had been taken in when a resumed run was saved.
+        config: Configuration of the run.
+        split: Validation rows of the shards that the run began with.
+        growing: Shards that have joined since; None for a complete dataset.
+        joined: Shards that had joined when a resumed run was saved.
 
     Attributes:
-        batches: Of pairs.
-        joined: Shards that have been taken in since the run began.
-        skipped: What is wrong with shards that cannot be read.
+        batches: Batches of pairs.
+        joined: Shards that have joined since the run began.
+        skipped: Errors of shards that cannot be read.
 
     Raises:
-        ShardError: None can be read.
+        ShardError: No pair can be read.
     """
 
     def __init__(
-        self, url: str, config: TrainConfig, split: Split, growth: Growth | None, joined: Collection[int] = ()
+        self, url: str, config: TrainConfig, split: Split, growing: GrowingSplit | None, joined: Collection[int] = ()
     ) -> None:
-        self._url, self._config, self._growth = url, config, growth
-        self._rows = dict(split.rows)
+        self._url, self._config, self._growing = url, config, growing
+        self._rows: dict[int, np.ndarray] = dict(split.rows)
         self.joined: set[int] = set()
         self.batches: list[Batch] = []
         self.skipped: tuple[str, ...] = ()
-        self._take_in(joined)
+        self._add(joined)
         self._make()
 
     def grow(self) -> bool:
-        """Take in what has joined since; whether anything did, so that errors before and after do not compare.
+        """Add pairs of shards that have joined; whether there were any: errors before and after are not comparable.
 
         Raises:
             ShardError: A shard that joined cannot be read.
         """
-        if self._growth is None or sum(map(len, self._rows.values())) >= self._config.validation.pairs:
+        if self._growing is None or sum(map(len, self._rows.values())) >= self._config.validation.pairs:
             return False
-        grown = self._take_in(self._growth.joined() - self.joined)
+        grown = self._add(self._growing.joined() - self.joined)
         if grown:
             self._make()
         return grown
 
-    def _take_in(self, shards: Collection[int]) -> bool:
-        """Whether any of these shards has held-out rows."""
-        if self._growth is None or not shards:
+    def _add(self, shards: Collection[int]) -> bool:
+        """Add these shards; whether they have validation rows."""
+        if self._growing is None or not shards:
             return False
-        read, rows = self._growth.held_out(self._url, shards)
+        read, rows = self._growing.validation_rows(self._url, shards)
         self.joined |= read
         self._rows |= rows
         return bool(rows)
@@ -73,7 +75,7 @@ class HeldOut:
         finally:
             source.close()
         if not self.batches:
-            raise ShardError(f"{self._url}: no held-out pair can be read; render its damaged shards again")
+            raise ShardError(f"{self._url}: no validation pair can be read; render its damaged shards again")
         self.skipped = tuple(message for batch in self.batches for message in batch.skipped)
 
 
@@ -85,7 +87,7 @@ def validation_batches(source: PairSource, split: Split, batch: int) -> Iterator
         arrays = source.load([shard]).get(shard, {})
         for row in rows if arrays else ():
             keys.append((0, shard, int(row)))
-            # copies, so that the shard need not stay in memory for the few rows of it that are measured
+            # copies, so that the shard need not stay in memory for a few rows
             samples.append({name: values[row].copy() for name, values in arrays.items()})
             if len(keys) == batch:
                 yield from _made(source, keys, samples)
@@ -97,7 +99,7 @@ def validation_batches(source: PairSource, split: Split, batch: int) -> Iterator
 def _made(
     source: PairSource, keys: Sequence[tuple[int, int, int]], samples: Sequence[dict[str, Any]]
 ) -> Iterator[Batch]:
-    """The batch of these samples; none when no object can be seen in any."""
+    """The batch of these samples; none when no object is visible."""
     made = source.batch(keys, samples)
     if made is not None:
         yield made

@@ -30,7 +30,7 @@ def colour(
     """
     b = len(scene_rgb)
     geometric = AugmentConfig(
-        background=config.background, occlusion=config.occlusion, occlusion_leaves=config.occlusion_leaves
+        background=config.background, occlusion=config.occlusion, min_visible_fraction=config.min_visible_fraction
     )
     if config == geometric:
         return scene_rgb, hypothesis_rgb, np.tile(np.eye(3, dtype=np.float32), (b, 1, 1))
@@ -64,7 +64,7 @@ def _to_uint8(values: Float[Array, "b p p 3"]) -> UInt8[Array, "b p p 3"]:
     return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
-def backdrop(
+def background_patch(
     source_rgb: UInt8[Array, "q q 3"] | None,
     foreground: Bool[Array, "q q"] | None,
     patch_px: int,

@@ -36,13 +36,13 @@ def fixed_sides_px(objects_card: Mapping[str, Mapping[str, Any]]) -> dict[int, f
     return {int(key): float(entry["window_side_px"]) for key, entry in objects_card.items()}
 
 
-def optical_axis_turn(angle_rad: float) -> Float[Array, "3 3"]:
+def optical_axis_rotation(angle_rad: float) -> Float[Array, "3 3"]:
     """Rotation of the scene about the camera's optical axis."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def recut_affine(
+def crop_affine(
     stored: Window, stored_px: int, K: Float[Array, "3 3"], turn: Float[Array, "3 3"], window: Window, patch_px: int
 ) -> Float[Array, "2 3"]:
     """Affine map from the stored patch's pixels to the new patch's, both continuous (pixel centre at + 0.5).
@@ -51,7 +51,7 @@ def recut_affine(
         stored: Window the stored patch was cut with.
         stored_px: Its side in its own pixels.
         K: Camera of the full image.
-        turn: Rotation about the optical axis, see `optical_axis_turn`.
+        turn: Rotation about the optical axis, see `optical_axis_rotation`.
         window: New window, in the image that the turned camera sees.
         patch_px: Side of the new patch.
     """

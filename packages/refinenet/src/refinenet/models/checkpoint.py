@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from refinenet import __version__
 from refinenet.config import NetworkConfig, TrainConfig
 from refinenet.models.heads import forms
+from refinenet.models.migration import migrated_config, migrated_state
 from refinenet.models.networks import make_network
 
 FORMAT, VERSION = "refinenet", "1"
@@ -151,7 +152,7 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
     if found != (FORMAT, VERSION):
         raise CheckpointError(f"{path}: format {found[0]} version {found[1]}, expected {FORMAT} version {VERSION}")
     try:
-        config = posecore_config.build(TrainConfig, json.loads(metadata["config"]), str(path))
+        config = posecore_config.build(TrainConfig, migrated_config(json.loads(metadata["config"])), str(path))
         provenance = Provenance(
             config=config,
             step=int(metadata["step"]),
@@ -182,7 +183,7 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
     """
     path = _state_path(folder, step)
     try:
-        state = dict(torch.load(path, map_location="cpu", weights_only=True))
+        state = migrated_state(torch.load(path, map_location="cpu", weights_only=True))
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"

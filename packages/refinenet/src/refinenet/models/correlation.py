@@ -111,7 +111,7 @@ def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
 
 
 def gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"], Float[Tensor, "b c p p"]]:
-    """Change over two pixels to the right and down; twin of the first half of `agreement.gradients`."""
+    """Change over two pixels to the right and down; counterpart of the first half of `orientation_gradients`."""
     padded = pad(values, (1, 1, 1, 1), mode="replicate")
     across, down = padded[..., 2:] - padded[..., :-2], padded[..., 2:, :] - padded[..., :-2, :]
     dx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]) / 4

@@ -17,9 +17,9 @@ from posecore.errors import CheckpointError, ConfigError
 from posecore.files import write_atomic
 from torch import Tensor, nn
 
+from refinenet.batch import NetworkInput
 from refinenet.config import NetworkConfig
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.models.networks import Pair
 
 INPUTS = ("scene_rgb", "hypothesis_rgb", "T_cam_obj", "K_crop", "hypothesis_depth_m")
 """The last for networks that see depth only."""
@@ -44,7 +44,7 @@ class FlatNetwork(nn.Module):
         hypothesis_depth_m: Tensor | None = None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         """The update of each pair, in camera axes about the object's origin."""
-        update = self.network(Pair(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
+        update = self.network(NetworkInput(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
         return (update.dR, update.dt) if update.confidence is None else (update.dR, update.dt, update.confidence)
 
 
@@ -71,7 +71,7 @@ def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
         parameter.requires_grad_(False)
     about = json.dumps(_about(loaded))
     config = loaded.provenance.config.network
-    example = random_pairs(2, config.patch_px, seed=0, depth=config.sees_depth)
+    example = random_pairs(2, config.patch_px, seed=0, depth=config.uses_depth)
     content = _onnx(network, example, about) if out.suffix == ".onnx" else _program(network, example, about)
     run = _onnx_runner(content) if out.suffix == ".onnx" else _program_runner(content)
     differences = _differences(network, run, config)
@@ -107,7 +107,7 @@ def random_pairs(b: int, patch_px: int, seed: int, *, depth: bool = False) -> tu
 def _differences(network: FlatNetwork, run: Callable[..., Outputs], config: NetworkConfig) -> dict[str, float]:
     worst: dict[str, float] = {}
     for b in CHECKED_BATCHES:
-        inputs = random_pairs(b, config.patch_px, seed=b, depth=config.sees_depth)
+        inputs = random_pairs(b, config.patch_px, seed=b, depth=config.uses_depth)
         with torch.no_grad():
             expected = network(*inputs)
         found = run(*inputs)

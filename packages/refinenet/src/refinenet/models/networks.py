@@ -1,40 +1,16 @@
 """The networks: PaperNet (frozen stems), CompactNet (matching, for two CPU cores), PlusNet (for a GPU), FlowNet."""
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
+from refinenet.batch import NetworkInput
 from refinenet.config import NetworkConfig
 from refinenet.geometry.poses import Flow, PoseUpdate
 from refinenet.models.correlation import GradientCorrelation, LocalCorrelation
 from refinenet.models.flow_solver import CELL_PX, surface_points, update_from_flow
 from refinenet.models.heads import ROTATION_BIAS, forms, pose_update, start_linear
 from refinenet.models.inception import ConvNorm, InceptionA, make_stem
-
-
-class Pair(NamedTuple):
-    """What a network sees.
-
-    Attributes:
-        scene_rgb: (b, 3, p, p) patch of the image.
-        hypothesis_rgb: (b, 3, p, p) render of the object alone on black, same window.
-        T_cam_obj: (b, 4, 4) the hypothesis, metres.
-        K_crop: (b, 3, 3) intrinsics of the patch.
-        hypothesis_depth_m: (b, p, p) camera z of the render, 0 beside it; None for networks that do not ask for it.
-    """
-
-    scene_rgb: UInt8[Tensor, "b 3 p p"]
-    hypothesis_rgb: UInt8[Tensor, "b 3 p p"]
-    T_cam_obj: Float[Tensor, "b 4 4"]
-    K_crop: Float[Tensor, "b 3 3"]
-    hypothesis_depth_m: Float[Tensor, "b p p"] | None = None
-
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> "Pair":
-        """Every field that is there, changed."""
-        return Pair(*(x if x is None else change(x) for x in self))  # type: ignore[arg-type]
 
 
 def normalised(rgb: UInt8[Tensor, "b 3 p p"]) -> Float[Tensor, "b 3 p p"]:
@@ -85,18 +61,18 @@ class PaperNet(nn.Module):
     def _branch(bias: tuple[float, ...], config: NetworkConfig) -> _Branch:
         return _Branch(config.branch_channels, len(bias), bias, config.head_std)
 
-    def forward(self, pair: Pair) -> PoseUpdate:
+    def forward(self, inputs: NetworkInput) -> PoseUpdate:
         """The update of each hypothesis."""
-        b = len(pair.scene_rgb)
+        b = len(inputs.scene_rgb)
         with torch.no_grad():
-            low = self.stem(normalised(torch.cat((pair.scene_rgb, pair.hypothesis_rgb))))
+            low = self.stem(normalised(torch.cat((inputs.scene_rgb, inputs.hypothesis_rgb))))
         x = torch.cat((low[:b], low[b:]), 1)
         x = self.blocks(torch.cat((self.pool(x), self.down(x)), 1))
         rotation, translation = self.rotation(x), self.translation(x)
         confidence = None if self.confidence is None else self.confidence(x).float()
         with torch.autocast(x.device.type, enabled=False):
             return pose_update(
-                rotation.float(), translation.float(), pair.T_cam_obj, pair.K_crop, self.patch_px, crop=self.crop,
+                rotation.float(), translation.float(), inputs.T_cam_obj, inputs.K_crop, self.patch_px, crop=self.crop,
                 confidence=confidence,
             )  # fmt: skip
 
@@ -150,21 +126,21 @@ class CompactNet(nn.Module):
             nn.Linear(last * (config.patch_px // 8) ** 2, config.hidden),
         )
 
-    def features(self, pair: Pair) -> Float[Tensor, "b h"]:
+    def features(self, inputs: NetworkInput) -> Float[Tensor, "b h"]:
         """What the heads read; runs in reduced precision under autocast."""
-        scene = self.scene(normalised(pair.scene_rgb).contiguous(memory_format=torch.channels_last))
-        hypothesis = self.hypothesis(normalised(pair.hypothesis_rgb).contiguous(memory_format=torch.channels_last))
+        scene = self.scene(normalised(inputs.scene_rgb).contiguous(memory_format=torch.channels_last))
+        hypothesis = self.hypothesis(normalised(inputs.hypothesis_rgb).contiguous(memory_format=torch.channels_last))
         matches = self.correlation(self.match_hypothesis(hypothesis), self.match_scene(scene))
         appearance = self.appearance(torch.cat((scene, hypothesis), 1))
         return self.mix(torch.cat((matches, appearance), 1).contiguous(memory_format=torch.channels_last))
 
-    def forward(self, pair: Pair) -> PoseUpdate:
+    def forward(self, inputs: NetworkInput) -> PoseUpdate:
         """The update of each hypothesis."""
-        x = self.features(pair)
+        x = self.features(inputs)
         with torch.autocast(x.device.type, enabled=False):  # poses need every digit
             x = self.norm(x.float())
             return pose_update(
-                self.rotation(x), self.translation(x), pair.T_cam_obj, pair.K_crop, self.patch_px, crop=self.crop,
+                self.rotation(x), self.translation(x), inputs.T_cam_obj, inputs.K_crop, self.patch_px, crop=self.crop,
                 confidence=None if self.confidence is None else self.confidence(x),
             )  # fmt: skip
 
@@ -258,16 +234,16 @@ class FlowNet(nn.Module):
         return nn.Sequential(ConvNorm(c_in, c_out, 3, stride=2, padding=1), ConvNorm(c_out, c_out, 3, padding=1))
 
     def _seen(
-        self, pair: Pair, depth_m: Float[Tensor, "b p p"], half_m: Float[Tensor, " b"]
+        self, inputs: NetworkInput, depth_m: Float[Tensor, "b p p"], half_m: Float[Tensor, " b"]
     ) -> tuple[Float[Tensor, "b 5 n n"], Float[Tensor, "b c"]]:
         """Head outputs, and the features of the whole; runs in reduced precision under autocast."""
         mask = (depth_m > 0).float()
-        relief = ((depth_m - pair.T_cam_obj[:, 2, 3, None, None]) / half_m[:, None, None]).clamp(-1.5, 1.5) * mask
-        render = torch.cat((normalised(pair.hypothesis_rgb), mask[:, None], relief[:, None]), 1)
-        scene = self.scene(normalised(pair.scene_rgb).contiguous(memory_format=torch.channels_last))
+        relief = ((depth_m - inputs.T_cam_obj[:, 2, 3, None, None]) / half_m[:, None, None]).clamp(-1.5, 1.5) * mask
+        render = torch.cat((normalised(inputs.hypothesis_rgb), mask[:, None], relief[:, None]), 1)
+        scene = self.scene(normalised(inputs.scene_rgb).contiguous(memory_format=torch.channels_last))
         hypothesis = self.hypothesis(render.contiguous(memory_format=torch.channels_last))
         appearance = self.appearance(torch.cat((scene, hypothesis), 1))
-        matches = self.correlation(pair.hypothesis_rgb, mask, pair.scene_rgb).to(appearance.dtype)
+        matches = self.correlation(inputs.hypothesis_rgb, mask, inputs.scene_rgb).to(appearance.dtype)
         fine = self.fine(torch.cat((matches, appearance), 1).contiguous(memory_format=torch.channels_last))
         coarse = self.coarse(fine)
         coarsest = self.coarsest(coarse)
@@ -275,21 +251,21 @@ class FlowNet(nn.Module):
         fine = self.join_fine(torch.cat((nn.functional.interpolate(coarse, scale_factor=2.0), fine), 1))
         return self.head(fine), torch.cat((coarsest.mean((2, 3)), fine.mean((2, 3))), 1)
 
-    def forward(self, pair: Pair) -> PoseUpdate:
+    def forward(self, inputs: NetworkInput) -> PoseUpdate:
         """The update of each hypothesis."""
-        depth_m, T = pair.hypothesis_depth_m, pair.T_cam_obj
-        assert depth_m is not None  # every stream fills it where the config says `sees_depth`
-        half_m = 0.5 * self.patch_px / pair.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
-        seen, whole = self._seen(pair, depth_m, half_m)
+        depth_m, T = inputs.hypothesis_depth_m, inputs.T_cam_obj
+        assert depth_m is not None  # every stream fills it where the config says `uses_depth`
+        half_m = 0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
+        seen, whole = self._seen(inputs, depth_m, half_m)
         with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit
             x = seen.float().permute(0, 2, 3, 1).flatten(1, 2)
             diagonal = torch.exp(x[..., 2:4].clamp(-MOST_CERTAIN, MOST_CERTAIN))
-            p_cam_m, uv_px, on_object = surface_points(depth_m, pair.K_crop)
+            p_cam_m, uv_px, on_object = surface_points(depth_m, inputs.K_crop)
             flow = Flow(
                 p_cam_m, uv_px, on_object, offset_px=CELL_PX * x[..., :2],
                 certainty=torch.stack((diagonal[..., 0], x[..., 4], diagonal[..., 1]), -1),
             )  # fmt: skip
-            update = update_from_flow(flow, T, pair.K_crop, half_m)
+            update = update_from_flow(flow, T, inputs.K_crop, half_m)
             if self.confidence is not None:
                 update = update._replace(confidence=self.confidence(whole.float())[:, 0])
         return update

@@ -1,219 +1,251 @@
-"""Refinement of a BOP result file: estimates in, estimates out, image by image."""
+"""Refinement of a BOP result file: initial poses in, refined poses out, image by image."""
 
-import itertools
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from posecore.bop import BopDataset, Estimate
-from posecore.bop.images import write_image
-from posecore.errors import CameraError, DatasetError
+import torch
+from posecore.bop import BopDataset, Estimate, read_results, read_sidecar, write_results
+from posecore.errors import ConfigError, PoseError
+from posecore.files import require_writable
 
 from refinenet import __version__
+from refinenet.models import checkpoint as checkpoints
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.refine.overlay import REFINED_RGB, START_RGB, Overlay
-from refinenet.refiner import Frame, PoseRefiner, Refinement, Request, Status
+from refinenet.refine.image_poses import ImagePoses, ImageResults, group_by_image, refine_images
+from refinenet.refine.overlay import OverlayFolder
+from refinenet.refine.registry import WITH_NETWORK, MethodSettings, make_refiner
+from refinenet.refine.workers import WorkerSettings, refine_images_in_workers
+from refinenet.refiner import PoseRefiner, Refinement, Status
 
-CARRIED = "perturbation"
-"""What the start poses' sidecar says of how each was made goes over unchanged."""
+PERTURBATION = "perturbation"
+"""Sidecar key of the initial poses' perturbations, copied unchanged."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineJob:
+    """Refinement of a result file.
+
+    Attributes:
+        method: Method and settings.
+        dataset: BOP dataset with the images and meshes.
+        init: Initial poses, a BOP result file.
+        out: Refined poses, a BOP result file; its sidecar lies beside it.
+        split: Split folder; None takes test, val, train_pbr, train or the only one.
+        objects: Objects to refine; all when empty.
+        keep_failed: Whether a failed pose is written as it was, with score 0, instead of left out.
+        name: Method's name in the sidecar; None takes the method's own.
+        overlay: Folder for a picture per image with the initial and refined contours.
+        candidates: Result file for all poses that a global search scored.
+        workers: Processes.
+        threads: Torch threads; 0 leaves torch's choice, and 1 to each of several processes.
+
+    Raises:
+        ConfigError: The method has no candidates.
+    """
+
+    method: MethodSettings
+    dataset: Path
+    init: Path
+    out: Path
+    split: str | None = None
+    objects: tuple[int, ...] = ()
+    keep_failed: bool = False
+    name: str | None = None
+    overlay: Path | None = None
+    candidates: Path | None = None
+    workers: int = 1
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        if self.candidates is not None and self.method.method not in WITH_NETWORK:
+            raise ConfigError(f"--candidates is for --method {WITH_NETWORK[0]}, {self.method.method} follows one pose")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class One:
-    """One start pose, what came of it, and how long its image took."""
+class RefinedPose:
+    """An initial pose, its refinement, and the image's run time."""
 
-    start: Estimate
+    initial: Estimate
     result: Refinement
-    taken_s: float
+    time_s: float
 
-    def estimate(self, found: Refinement) -> Estimate:
-        """A pose that was found from the start, as a line of a result file."""
-        unfailed = self.start.score if found.confidence is None else found.confidence
-        score = 0.0 if found.failed else float(unfailed)
-        return replace(self.start, T_cam_obj=np.asarray(found.T_cam_obj), score=score, time_s=self.taken_s)
+    def estimate(self, refinement: Refinement) -> Estimate:
+        """A pose that came from this initial pose, as a line of a result file.
+
+        The score is the method's confidence, or the initial pose's score where the method has none.
+        """
+        score = self.initial.score if refinement.confidence is None else refinement.confidence
+        return replace(
+            self.initial, T_cam_obj=np.asarray(refinement.T_cam_obj), time_s=self.time_s,
+            score=0.0 if refinement.failed else float(score),
+        )  # fmt: skip
 
 
 @dataclass(kw_only=True, eq=False)
-class Refined:
-    """A refined result file in memory, as far as it has come.
+class RefinedFile:
+    """Refined poses of a result file, possibly incomplete.
 
     Attributes:
-        keep_failed: Whether a start pose whose refinement failed is an estimate as it was, with score 0, or left out,
-            so that evaluation counts it as missing.
-        done: By the place of the start pose.
+        keep_failed: Whether a failed pose is written as it was, with score 0, or left out, so that evaluation counts it
+            as missing.
+        by_index: Refined poses by the index of their initial pose.
     """
 
     keep_failed: bool = False
-    done: dict[int, One] = field(default_factory=dict)
+    by_index: dict[int, RefinedPose] = field(default_factory=dict)
+
+    def add(self, image: ImagePoses, results: ImageResults, initial_poses: Sequence[Estimate]) -> None:
+        """Add the results of an image."""
+        for index, refinement in zip(image.indices, results.refinements, strict=True):
+            self.by_index[index] = RefinedPose(initial=initial_poses[index], result=refinement, time_s=results.time_s)
 
     @property
-    def all(self) -> list[One]:
-        """In the order of the start poses."""
-        return [self.done[place] for place in sorted(self.done)]
+    def poses(self) -> list[RefinedPose]:
+        """All poses, in the order of the initial poses."""
+        return [self.by_index[index] for index in sorted(self.by_index)]
 
     @property
-    def kept(self) -> list[One]:
-        """Those that are estimates."""
-        return [one for one in self.all if self.keep_failed or not one.result.failed]
+    def written(self) -> list[RefinedPose]:
+        """Poses that the result file holds."""
+        return [pose for pose in self.poses if self.keep_failed or not pose.result.failed]
 
     @property
     def estimates(self) -> list[Estimate]:
         """Lines of the result file."""
-        return [one.estimate(one.result) for one in self.kept]
+        return [pose.estimate(pose.result) for pose in self.written]
 
     @property
-    def failures(self) -> dict[int, str]:
-        """Why poses failed, by their line in the start file."""
-        return {one.start.line: one.result.failure or "" for one in self.all if one.result.failed}
+    def failed(self) -> list[RefinedPose]:
+        """Poses whose refinement failed."""
+        return [pose for pose in self.poses if pose.result.failed]
 
     @property
     def converged(self) -> int:
-        """How many stopped on a small update."""
-        return sum(one.result.status is Status.CONVERGED for one in self.all)
+        """Number of poses whose last update was small."""
+        return sum(pose.result.status is Status.CONVERGED for pose in self.poses)
 
     @property
-    def tried(self) -> list[Estimate]:
-        """Every pose that the method weighed, from all start poses, those that failed too."""
-        return [one.estimate(found) for one in self.all for found in one.result.tried]
+    def candidates(self) -> list[Estimate]:
+        """All poses that the method scored, those of failed initial poses included."""
+        return [pose.estimate(candidate) for pose in self.poses for candidate in pose.result.candidates]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ImageStarts:
-    """The start poses in one image.
+class RefineSummary:
+    """Outcome of a job.
 
     Attributes:
-        scene_id: Its scene.
-        im_id: Its number there.
-        places: Of the start poses among all.
-        requests: The poses to refine, in that order.
+        refined: Refined poses, as written.
+        not_reached: Number of initial poses that were not reached.
+        stopped: Error or Ctrl-C that ended the job early; None where all poses were reached.
     """
 
-    scene_id: int
-    im_id: int
-    places: tuple[int, ...]
-    requests: tuple[Request, ...]
+    refined: RefinedFile
+    not_reached: int = 0
+    stopped: BaseException | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Results:
-    """What came of the poses of one image, and how long all of them took, rendering included, reading excluded."""
+def refine_result_file(
+    job: RefineJob, on_image: Callable[[int, int], None] = lambda done, total: None
+) -> RefineSummary:
+    """Refine the poses of a result file; write the refined file with its sidecar, and what else the job names.
 
-    found: tuple[Refinement, ...]
-    taken_s: float
-
-
-def by_image(starts: Sequence[Estimate]) -> list[ImageStarts]:
-    """Start poses image by image, in the order of scenes and images."""
-    order = sorted(range(len(starts)), key=lambda i: (starts[i].scene_id, starts[i].im_id))
-    images = []
-    for (scene_id, im_id), group in itertools.groupby(order, key=lambda i: (starts[i].scene_id, starts[i].im_id)):
-        places = tuple(group)
-        requests = tuple(Request(obj_id=starts[i].obj_id, T_cam_obj=starts[i].T_cam_obj) for i in places)
-        images.append(ImageStarts(scene_id=scene_id, im_id=im_id, places=places, requests=requests))
-    return images
-
-
-def add_results(
-    refined: Refined,
-    starts: Sequence[Estimate],
-    images: Sequence[ImageStarts],
-    results: Iterable[Results],
-    *,
-    on_image: Callable[[ImageStarts, Results], None],
-) -> None:
-    """Add what comes of image after image to `refined`, so that an error on the way loses nothing.
-
-    An estimate's score is the method's confidence (the start's score where it has none), its time that of refining all
-    poses of its image.
+    An error or Ctrl-C after the first image loses nothing: the finished poses are written, the sidecar counts the
+    others as `not_reached`, and the summary holds the error. Before that, the error is raised and nothing is written.
 
     Args:
-        refined: Filled.
-        starts: Start poses.
-        images: These, image by image.
-        results: For each image.
-        on_image: Called after each.
-    """
-    for image, result in zip(images, results, strict=True):
-        for place, one in zip(image.places, result.found, strict=True):
-            refined.done[place] = One(start=starts[place], result=one, taken_s=result.taken_s)
-        on_image(image, result)
-
-
-class OverlayFolder:
-    """Pictures of images with the start poses' contours in red, and those of refined ones in green.
-
-    Args:
-        dataset: With the images and meshes.
-        obj_ids: Objects that are drawn.
-        folder: For one picture an image.
-    """
-
-    def __init__(self, dataset: BopDataset, obj_ids: Collection[int], folder: Path) -> None:
-        self._dataset = dataset
-        self._folder = folder
-        self._overlay = Overlay({i: dataset.mesh(i) for i in sorted(obj_ids)})
-
-    def close(self) -> None:
-        """Free what the renderer holds."""
-        self._overlay.close()
-
-    def write(self, image: ImageStarts, results: Results) -> None:
-        """Draw one image."""
-        K = self._dataset.camera(image.scene_id, image.im_id).K
-        rgb = self._dataset.rgb(image.scene_id, image.im_id)
-        good = [
-            Request(obj_id=request.obj_id, T_cam_obj=one.T_cam_obj)
-            for request, one in zip(image.requests, results.found, strict=True)
-            if not one.failed
-        ]
-        picture = self._overlay.draw(self._overlay.draw(rgb, K, image.requests, START_RGB), K, good, REFINED_RGB)
-        write_image(self._folder / f"{image.scene_id:06d}_{image.im_id:06d}.png", picture)
-
-
-def load_frame(dataset: BopDataset, scene_id: int, im_id: int, method: PoseRefiner) -> Frame:
-    """An image with its camera, and with its depth where the method needs that.
+        job: Input, method and outputs.
+        on_image: Called before the first image and after each image, with the number of finished poses and of all.
 
     Raises:
-        DatasetError: There is none, or it is damaged.
+        ConfigError: There are no poses, or none of a requested object.
+        PoseError: An input is missing or damaged, an output cannot be written, or the method cannot be made.
     """
-    depth_m = dataset.depth_m(scene_id, im_id) if method.needs_depth else None
-    if method.needs_depth and depth_m is None:
-        raise DatasetError(
-            f"{dataset.scene_path(scene_id)}: image {im_id} has no depth, which {method.name} needs; "
-            "choose a method that works on colour"
-        )
-    image = dataset.rgb(scene_id, im_id)
+    if job.threads:
+        torch.set_num_threads(job.threads)
+    loaded = None if job.method.checkpoint is None else checkpoints.load(job.method.checkpoint)
+    dataset = BopDataset(job.dataset, job.split)
+    initial_poses = _initial_poses(job, dataset)
+    initial_sidecar = read_sidecar(job.init) or {}
+    for path in filter(None, (job.out, job.candidates, job.overlay and job.overlay / "overlay.png")):
+        require_writable(path)
+    obj_ids = tuple(sorted({pose.obj_id for pose in initial_poses}))
+    method = make_refiner(job.method, {i: dataset.mesh(i) for i in obj_ids}, loaded)
+    refined, stopped, images = RefinedFile(keep_failed=job.keep_failed), None, group_by_image(initial_poses)
     try:
-        return Frame(image=image, K=dataset.camera(scene_id, im_id).K, depth_m=depth_m)
-    except CameraError as error:
-        raise CameraError(f"{dataset.scene_path(scene_id)}: image {im_id}: {error}") from error
+        with ExitStack() as stack:
+            stack.enter_context(closing(method))
+            pictures = job.overlay and stack.enter_context(closing(OverlayFolder(dataset, obj_ids, job.overlay)))
+            on_image(0, len(initial_poses))
+            if (workers := min(job.workers, len(images))) > 1:
+                settings = WorkerSettings(
+                    method=job.method, dataset=job.dataset, split=dataset.split, obj_ids=obj_ids, threads=job.threads
+                )
+                results = stack.enter_context(refine_images_in_workers(settings, images, workers))
+            else:
+                results = refine_images(dataset, method, images)
+            for image, result in zip(images, results, strict=True):
+                refined.add(image, result, initial_poses)
+                if pictures:
+                    pictures.write(image, result)
+                on_image(len(refined.by_index), len(initial_poses))
+    except (KeyboardInterrupt, PoseError, OSError) as error:
+        if not refined.by_index:
+            raise
+        stopped = error
+    not_reached = len(initial_poses) - len(refined.by_index)
+    sidecar = _sidecar(job, dataset, method, loaded, initial_sidecar, refined)
+    _write(job, refined, sidecar | ({"not_reached": not_reached} if not_reached else {}))
+    return RefineSummary(refined=refined, not_reached=not_reached, stopped=stopped)
 
 
-def make_sidecar(
-    *,
+def _initial_poses(job: RefineJob, dataset: BopDataset) -> list[Estimate]:
+    estimates = read_results(job.init, dataset, images="camera")
+    if not estimates:
+        raise ConfigError(f"{job.init}: no poses in it, there is nothing to refine")
+    chosen = [pose for pose in estimates if not job.objects or pose.obj_id in job.objects]
+    if missing := sorted(set(job.objects) - {pose.obj_id for pose in chosen}):
+        raise ConfigError(f"{job.init}: no pose of object {', '.join(map(str, missing))}; change --object")
+    return chosen
+
+
+def _write(job: RefineJob, refined: RefinedFile, sidecar: Mapping[str, Any]) -> None:
+    write_results(job.out, refined.estimates, dict(sidecar))
+    if job.candidates is not None:
+        common = {key: sidecar[key] for key in ("dataset", "split", "settings", "init")}
+        write_results(job.candidates, refined.candidates, common | {"method": f"{sidecar['method']}, all candidates"})
+
+
+def _sidecar(
+    job: RefineJob,
     dataset: BopDataset,
     method: PoseRefiner,
-    name: str,
     loaded: Checkpoint | None,
-    start_path: Path,
-    start_sidecar: dict[str, Any],
-    refined: Refined,
+    initial_sidecar: Mapping[str, Any],
+    refined: RefinedFile,
 ) -> dict[str, Any]:
-    """What is written beside a refined result file.
+    """Sidecar of the refined result file.
 
-    `initial_lines` holds the start file's line of every estimate, `failed_lines` those of the poses that failed. What
-    the start file's own sidecar says about how its poses were perturbed is carried over.
+    `initial_lines` holds the line of each estimate in the initial file, `failed_lines` the lines of failed poses. The
+    perturbations in the initial file's sidecar are copied.
     """
-    sidecar: dict[str, Any] = {"dataset": str(dataset.root.resolve()), "split": dataset.split, "method": name}
+    sidecar: dict[str, Any] = {
+        "dataset": str(dataset.root.resolve()),
+        "split": dataset.split,
+        "method": job.name or method.name,
+    }
     if loaded is not None:
         sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
+    failures = {pose.initial.line: pose.result.failure or "" for pose in refined.failed}
     sidecar |= {
         "settings": {"refinenet": __version__, **method.settings},
-        "init": start_path.name,
-        "initial_lines": [one.start.line for one in refined.kept],
-        "failed_lines": list(refined.failures),
-        "failures": {str(line): why for line, why in refined.failures.items()},
+        "init": job.init.name,
+        "initial_lines": [pose.initial.line for pose in refined.written],
+        "failed_lines": list(failures),
+        "failures": {str(line): reason for line, reason in failures.items()},
     }
-    return sidecar | ({CARRIED: start_sidecar[CARRIED]} if CARRIED in start_sidecar else {})
+    return sidecar | ({PERTURBATION: initial_sidecar[PERTURBATION]} if PERTURBATION in initial_sidecar else {})

@@ -1,4 +1,4 @@
-"""What is checked of an object before its poses are refined: is it the trained one, in the trained unit."""
+"""Checks of a mesh before refinement: the trained object, in the trained unit."""
 
 from posecore.errors import CheckpointError
 from posecore.mesh import Mesh, mesh_digest
@@ -6,16 +6,18 @@ from posecore.mesh import Mesh, mesh_digest
 from refinenet.models.checkpoint import Checkpoint
 
 DIAMETER_TOLERANCE = 0.02
+"""Largest relative difference between the diameters of a mesh and of the trained one."""
 MEMBER_SIZES = (0.8, 1.25)
-"""Smallest and largest member of a category, as shares of the smallest and largest trained one's diameter."""
+"""Smallest and largest member of a category, as fractions of the smallest and largest trained diameter."""
+UNIT_FACTORS = {1e3: "a thousand times", 1e-3: "a thousand times", 10.0: "ten times", 0.1: "ten times"}
+"""Ratios of diameters that a mesh in another unit has."""
 
 
 def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_mesh: bool = False) -> None:
-    """Refuse a mesh that the checkpoint was not trained with; for a category, one of another size than its members.
+    """Refuse a mesh that is not the trained one; for a category, a mesh outside the range of its members' sizes.
 
-    First the size, as the same file may be read in another unit; then the hash decides, that of the file, or
-    `mesh_digest`. A checkpoint that has no `mesh_digest` cannot tell a mesh
-    that was written anew from another one of its size; such a mesh passes.
+    The diameter is compared first, as the same file may be read in another unit. Then the hash of the file or
+    `mesh_digest` decides. A checkpoint without `mesh_digest` accepts any mesh of the trained diameter.
 
     Raises:
         CheckpointError: The object is not in the training data, has another size, or is another mesh.
@@ -25,21 +27,23 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
         _require_member(loaded, obj_id, mesh)
         return
     if str(obj_id) not in objects:
-        known = ", ".join(sorted(objects, key=int))
+        trained_ids = ", ".join(sorted(objects, key=int))
         raise CheckpointError(
-            f"{loaded.path}: object {obj_id} was not in its training data (objects {known}); "
+            f"{loaded.path}: object {obj_id} was not in its training data (objects {trained_ids}); "
             "choose another checkpoint, or name the objects to refine with --object"
         )
     trained = objects[str(obj_id)]
     trained_m = float(trained["diameter_m"])
     ratio = mesh.diameter_m / trained_m
     if abs(ratio - 1) > DIAMETER_TOLERANCE:
-        unit = next((word for factor, word in _UNITS.items() if abs(ratio / factor - 1) < DIAMETER_TOLERANCE), None)
-        why = f"it was read in {unit} too large a unit" if ratio > 1 and unit else "another object, or another unit"
-        why = f"it was read in {unit} too small a unit" if ratio < 1 and unit else why
+        unit = next(
+            (word for factor, word in UNIT_FACTORS.items() if abs(ratio / factor - 1) < DIAMETER_TOLERANCE), None
+        )
+        size = "large" if ratio > 1 else "small"
+        reason = f"it was read in {unit} too {size} a unit" if unit else "another object, or another unit"
         raise CheckpointError(
             f"{loaded.path}: object {obj_id} had a diameter of {1e3 * trained_m:.1f} mm in training, this one has "
-            f"{1e3 * mesh.diameter_m:.6g} mm: {why}"
+            f"{1e3 * mesh.diameter_m:.6g} mm: {reason}"
         )
     if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
         return
@@ -60,6 +64,3 @@ def _require_member(loaded: Checkpoint, obj_id: int, mesh: Mesh) -> None:
             f"{1e3 * least_m:.1f} to {1e3 * most_m:.1f} mm, as the members of the category that it was trained on: "
             "no member, or read in another unit"
         )
-
-
-_UNITS = {1e3: "a thousand times", 1e-3: "a thousand times", 10.0: "ten times", 0.1: "ten times"}

@@ -1,19 +1,22 @@
-"""Pictures of poses over images: silhouette contours, and lines of text."""
+"""Images with the silhouette contours of poses and lines of text."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore.bop import BopDataset
+from posecore.bop.images import write_image
 from posecore.contour import contour_mask
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 
+from refinenet.refine.image_poses import ImagePoses, ImageResults
 from refinenet.refiner import Request
 
-Array = np.ndarray
 Colour = tuple[int, int, int]
-START_RGB: Colour = (230, 60, 40)
+INITIAL_RGB: Colour = (230, 60, 40)
 REFINED_RGB: Colour = (60, 230, 90)
 
 
@@ -28,13 +31,13 @@ class Overlay:
         self._rasteriser = Rasteriser(meshes)
 
     def close(self) -> None:
-        """Free what the renderer holds."""
+        """Free the renderer."""
         self._rasteriser.close()
 
     def draw(
-        self, image: UInt8[Array, "h w 3"], K: Float[Array, "3 3"], poses: Sequence[Request], rgb: Colour
-    ) -> UInt8[Array, "h w 3"]:
-        """A copy of the image with the contour of every pose in one colour; what is not finite is left out."""
+        self, image: UInt8[np.ndarray, "h w 3"], K: Float[np.ndarray, "3 3"], poses: Sequence[Request], rgb: Colour
+    ) -> UInt8[np.ndarray, "h w 3"]:
+        """A copy of the image with the contours of all finite poses in one colour."""
         picture = image.copy()
         height_px, width_px = image.shape[:2]
         for pose in poses:
@@ -44,7 +47,38 @@ class Overlay:
         return picture
 
 
-def write_line(image: UInt8[Array, "h w 3"], text: str, rgb: Colour, line: int = 0) -> UInt8[Array, "h w 3"]:
+class OverlayFolder:
+    """A picture per image: contours of the initial poses in red, of the refined ones in green.
+
+    Args:
+        dataset: With the images and meshes.
+        obj_ids: Objects to draw.
+        folder: Folder of the pictures.
+    """
+
+    def __init__(self, dataset: BopDataset, obj_ids: Collection[int], folder: Path) -> None:
+        self._dataset = dataset
+        self._folder = folder
+        self._overlay = Overlay({i: dataset.mesh(i) for i in sorted(obj_ids)})
+
+    def close(self) -> None:
+        """Free the renderer."""
+        self._overlay.close()
+
+    def write(self, image: ImagePoses, results: ImageResults) -> None:
+        """Draw an image."""
+        K = self._dataset.camera(image.scene_id, image.im_id).K
+        rgb = self._dataset.rgb(image.scene_id, image.im_id)
+        refined = [
+            Request(obj_id=request.obj_id, T_cam_obj=refinement.T_cam_obj)
+            for request, refinement in zip(image.requests, results.refinements, strict=True)
+            if not refinement.failed
+        ]
+        picture = self._overlay.draw(self._overlay.draw(rgb, K, image.requests, INITIAL_RGB), K, refined, REFINED_RGB)
+        write_image(self._folder / f"{image.scene_id:06d}_{image.im_id:06d}.png", picture)
+
+
+def write_line(image: UInt8[np.ndarray, "h w 3"], text: str, rgb: Colour, line: int = 0) -> UInt8[np.ndarray, "h w 3"]:
     """A copy of the image with a line of text at its top left, dark behind it; `line` counts downwards."""
     picture = image.copy()
     scale = max(0.4, image.shape[0] / 900)

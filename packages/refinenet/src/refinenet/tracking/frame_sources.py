@@ -1,4 +1,4 @@
-"""Where tracked frames come from: a BOP scene, a folder of images, a video file."""
+"""Sources of frames to track: a BOP scene, a folder of images, a video file."""
 
 import itertools
 import json
@@ -16,17 +16,16 @@ from posecore.bop.images import COLOUR_EXTENSIONS, read_rgb
 from posecore.camera import intrinsics
 from posecore.errors import CameraError, ConfigError, DatasetError
 
-from refinenet.refine.bop_results import load_frame
+from refinenet.refine.image_poses import load_frame
 from refinenet.refiner import Frame, PoseRefiner
 
-Array = np.ndarray
-MIN_SHARE = 0.9
-"""Of the frames that a video's file promises; containers count inexactly."""
+MIN_FRAME_FRACTION = 0.9
+"""Least fraction of the frame count in a video's header that must decode; containers count inexactly."""
 
 
 @runtime_checkable
 class FrameSequence(Protocol):
-    """Frames in order, numbered as a BOP result file numbers them."""
+    """Frames in order, with the image numbers of the BOP result file."""
 
     @property
     def scene_id(self) -> int:
@@ -34,14 +33,14 @@ class FrameSequence(Protocol):
         ...
 
     def __len__(self) -> int:
-        """How many frames there are; of a video as its file says."""
+        """Number of frames; of a video, the count in its header."""
         ...
 
     def frames(self, method: PoseRefiner) -> Iterator[tuple[int, Frame]]:
         """Yield image number and frame, with depth where the method needs it.
 
         Raises:
-            DatasetError: A frame has none.
+            DatasetError: A frame has no depth, or is damaged.
         """
         ...
 
@@ -67,9 +66,9 @@ class BopScene:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ImageFolder:
-    """The images of a folder, by the numbers in their names: `f2` is before `f10`.
+    """The images of a folder, ordered by the numbers in their names: `f2` is before `f10`.
 
-    Names that are numbers are the frames' numbers, others are numbered from 0.
+    Names that are numbers become the frame numbers, others are numbered from 0.
     """
 
     folder: Path
@@ -81,9 +80,9 @@ class ImageFolder:
         if not files:
             kinds = ", ".join(COLOUR_EXTENSIONS)
             raise DatasetError(f"{self.folder}: no images ({kinds}) in it; give a folder of images")
-        for one, other in itertools.pairwise(files):
-            if one.stem.isdecimal() and other.stem.isdecimal() and int(one.stem) == int(other.stem):
-                raise DatasetError(f"{self.folder}: {one.name} and {other.name} have one number; keep one of them")
+        for file, after in itertools.pairwise(files):
+            if file.stem.isdecimal() and after.stem.isdecimal() and int(file.stem) == int(after.stem):
+                raise DatasetError(f"{self.folder}: {file.name} and {after.name} have one number; keep one file")
 
     def __len__(self) -> int:
         return len(self._files())
@@ -102,7 +101,7 @@ class ImageFolder:
 
 
 def _with_numbers(file: Path) -> tuple[list[tuple[str, int]], str]:
-    """A file name's text and numbers in turn."""
+    """Sort key of a file name: text and numbers in turn."""
     return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", file.stem)], file.name
 
 
@@ -143,7 +142,7 @@ class VideoFile:
             video.release()
         if number == 0:
             raise DatasetError(f"{self.file}: no frame can be decoded; convert it, or give a folder of images")
-        if number < MIN_SHARE * len(self):
+        if number < MIN_FRAME_FRACTION * len(self):
             raise DatasetError(
                 f"{self.file}: ends after frame {number} of {len(self)}, it is damaged or cut off; "
                 "copy or convert it anew"
@@ -160,14 +159,14 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
 
     Args:
         source: Folder or file.
-        split: Of a BOP dataset.
-        scene: Of a BOP dataset; may be left out where it has only one.
+        split: Split of a BOP dataset.
+        scene: Scene of a BOP dataset; optional where there is only one.
         camera: BOP `camera.json`, for images and videos.
 
     Raises:
         DatasetError: There is no such path, or it holds no frames.
-        ConfigError: A scene must be chosen, a camera is missing, or an option is for the other kind of source.
-        CameraError: The camera file is no camera.
+        ConfigError: The scene is ambiguous, a camera is missing, or an option is for the other kind of source.
+        CameraError: The file holds no camera.
     """
     if not source.exists():
         raise DatasetError(f"{source}: no such folder or file; give a BOP dataset, a folder of images or a video")
@@ -178,17 +177,17 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
         if scene is None and len(dataset.scene_ids) > 1:
             some = ", ".join(map(str, dataset.scene_ids[:10]))
             raise ConfigError(f"{source}: has {len(dataset.scene_ids)} scenes ({some}); choose one with --scene")
-        chosen = BopScene(dataset=dataset, scene_id=dataset.scene_ids[0] if scene is None else scene)
-        dataset.scene_path(chosen.scene_id)
-        return chosen
+        sequence = BopScene(dataset=dataset, scene_id=dataset.scene_ids[0] if scene is None else scene)
+        dataset.scene_path(sequence.scene_id)
+        return sequence
     if split is not None:
         raise ConfigError(f"--split is for BOP datasets; {source} has no models folder, so it is none")
     if camera is None:
         raise ConfigError(f"{source}: images and videos need --camera, a BOP camera.json with fx, fy, cx, cy")
-    seen_by = read_camera(camera)
+    file_camera = read_camera(camera)
     if source.is_dir():
-        return ImageFolder(folder=source, camera=seen_by, scene_id=scene or 0)
-    return VideoFile(file=source, camera=seen_by, scene_id=scene or 0)
+        return ImageFolder(folder=source, camera=file_camera, scene_id=scene or 0)
+    return VideoFile(file=source, camera=file_camera, scene_id=scene or 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,26 +195,26 @@ class FileCamera:
     """A camera from a file.
 
     Attributes:
-        file: Where it stands.
+        file: Camera file.
         K: Camera matrix.
-        size_px: Width and height of its images; None where the file does not say.
+        size_px: Width and height of the images; None where the file has no size.
     """
 
     file: Path
-    K: Float[Array, "3 3"]
+    K: Float[np.ndarray, "3 3"]
     size_px: tuple[int, int] | None = None
 
-    def frame(self, image: UInt8[Array, "h w 3"], name: str) -> Frame:
-        """An image that this camera took.
+    def frame(self, image: UInt8[np.ndarray, "h w 3"], name: str) -> Frame:
+        """An image from this camera as a frame.
 
         Raises:
-            CameraError: It has another size than the camera.
+            CameraError: The image has another size than the camera.
         """
-        found = (image.shape[1], image.shape[0])
-        if self.size_px is not None and found != self.size_px:
+        size_px = (image.shape[1], image.shape[0])
+        if self.size_px is not None and size_px != self.size_px:
             raise CameraError(
-                f"{name}: found {found[0]} x {found[1]} px, expected {self.size_px[0]} x {self.size_px[1]} px as "
-                f"{self.file} says; give the camera of these images"
+                f"{name}: found {size_px[0]} x {size_px[1]} px, expected {self.size_px[0]} x {self.size_px[1]} px as "
+                f"in {self.file}; give the camera of these images"
             )
         try:
             return Frame(image=image, K=self.K)
@@ -224,10 +223,10 @@ class FileCamera:
 
 
 def read_camera(file: Path) -> FileCamera:
-    """A BOP `camera.json`: fx, fy, cx, cy in pixels, and width and height where they are given.
+    """Read a BOP `camera.json`: fx, fy, cx, cy in pixels, optionally width and height.
 
     Raises:
-        CameraError: The file is missing, not JSON, or lacks one of the former.
+        CameraError: The file is missing, not JSON, or lacks a focal length or principal point.
     """
     try:
         content: Any = json.loads(file.read_text(encoding="utf-8"))
@@ -240,46 +239,5 @@ def read_camera(file: Path) -> FileCamera:
         raise CameraError(f"{file}: found no numbers fx, fy, cx, cy ({error}); give a BOP camera.json") from error
 
 
-def _rgb(image: UInt8[Array, "h w 3"]) -> UInt8[Array, "h w 3"]:
+def _rgb(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
-
-
-class VideoWriter:
-    """Writes RGB frames to a video file until it is closed; a context manager.
-
-    Args:
-        file: Path; the ending decides the container (.mp4, .avi, ...).
-        fps: Frames a second.
-    """
-
-    def __init__(self, file: Path, fps: float) -> None:
-        self._file, self._fps = file, fps
-        self._writer: cv2.VideoWriter | None = None
-
-    def __enter__(self) -> "VideoWriter":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._writer is not None:
-            self._writer.release()
-
-    def write(self, image: UInt8[Array, "h w 3"]) -> None:
-        """Append a frame; the first decides the size.
-
-        Raises:
-            DatasetError: OpenCV has no encoder for this kind of file, or a frame has another size.
-        """
-        height_px, width_px = image.shape[:2]
-        if self._writer is None:
-            self._file.parent.mkdir(parents=True, exist_ok=True)
-            code = cv2.VideoWriter.fourcc(*("MJPG" if self._file.suffix.lower() == ".avi" else "mp4v"))
-            self._writer = cv2.VideoWriter(str(self._file), code, self._fps, (width_px, height_px))
-            self._size = (width_px, height_px)
-            if not self._writer.isOpened():
-                raise DatasetError(
-                    f"{self._file}: OpenCV cannot write such a video; choose a name ending in .mp4 or .avi"
-                )
-        if (width_px, height_px) != self._size:
-            found, first = f"{width_px} x {height_px}", f"{self._size[0]} x {self._size[1]}"
-            raise DatasetError(f"{self._file}: a frame has {found} px, the first had {first} px; a video has one size")
-        self._writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

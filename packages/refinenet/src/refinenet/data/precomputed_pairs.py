@@ -1,4 +1,4 @@
-"""Pairs exactly as shards hold them, for networks that look through the shard's own fixed window."""
+"""Precomputed pairs, as shards hold them, for networks with the shards' fixed window."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,36 +10,38 @@ from posecore.shard import BIT_FOREGROUND
 from refinenet.config import AugmentConfig, TrainConfig
 from refinenet.data.online_pairs import PairArrays
 from refinenet.image import augmentation
-from refinenet.image.masks import visible_overlap
+from refinenet.image.masks import visible_mask_iou
 
-STORED_FIELDS = (
+PRECOMPUTED_FIELDS = (
     "scene_rgb", "hypothesis_rgb", "T_cam_obj", "T_cam_obj_hypothesis", "K_crop", "scene_contour_cam_m",
     "hypothesis_contour_cam_m", "scene_distance_px", "hypothesis_distance_px", "scene_mask", "obj_id",
 )  # fmt: skip
 
 
-def stored_pairs(
+def precomputed_pairs(
     samples: Sequence[Mapping[str, Any]],
     rngs: Sequence[np.random.Generator],
     config: TrainConfig,
     augment_config: AugmentConfig,
-    where: str,
+    url: str,
 ) -> PairArrays:
-    """Stack samples into a batch; contour points are thinned evenly to the configured number.
+    """Stack samples into a batch; contour points are subsampled evenly to the configured number.
 
     Raises:
         ConfigError: The shards' patches are not of the network's size, or hold fewer contour points than asked for.
     """
-    stored_px, wanted_px = len(samples[0]["scene_rgb"]), config.network.patch_px
-    if stored_px != wanted_px:
+    shard_px, patch_px = len(samples[0]["scene_rgb"]), config.network.patch_px
+    if shard_px != patch_px:
         raise ConfigError(
-            f"{where}: patches of {stored_px} px, preset {config.preset} expects {wanted_px}; "
-            f"render with --set patch_px={wanted_px}"
+            f"{url}: patches of {shard_px} px, preset {config.preset} expects {patch_px}; "
+            f"render with --set patch_px={patch_px}"
         )
-    stored, n = len(samples[0]["scene_contour_cam_m"]), config.loss.contour_points
-    if n > stored:
-        raise ConfigError(f"{where}: {stored} contour points, loss.contour_points is {n}; set it to {stored} or less")
-    thin = (np.arange(n) * stored) // n
+    available, n = len(samples[0]["scene_contour_cam_m"]), config.loss.contour_points
+    if n > available:
+        raise ConfigError(
+            f"{url}: {available} contour points, loss.contour_points is {n}; set it to {available} or less"
+        )
+    thin = (np.arange(n) * available) // n
 
     def stack(name: str) -> np.ndarray:
         return np.stack([sample[name] for sample in samples])
@@ -48,12 +50,12 @@ def stored_pairs(
     for i, (sample, rng) in enumerate(zip(samples, rngs, strict=True)):
         if rng.random() < augment_config.background:
             other = samples[int(rng.integers(len(samples)))]
-            behind = augmentation.backdrop(
-                other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, stored_px, rng
+            behind = augmentation.background_patch(
+                other["scene_rgb"], (other["scene_mask"] & BIT_FOREGROUND) > 0, shard_px, rng
             )
             scenes[i] = np.where((sample["scene_mask"] & BIT_FOREGROUND)[..., None] > 0, scenes[i], behind)
     depth_m = stack("hypothesis_depth_m") if "hypothesis_depth_m" in samples[0] else None
-    overlap = None if depth_m is None else visible_overlap(depth_m > 0, stack("scene_mask"))
+    visible_iou = None if depth_m is None else visible_mask_iou(depth_m > 0, stack("scene_mask"))
     scene_rgb, hypothesis_rgb, render_colours = augmentation.colour(
         scenes, stack("hypothesis_rgb"), augment_config, rngs[0]
     )
@@ -69,7 +71,7 @@ def stored_pairs(
         hypothesis_distance_px=stack("hypothesis_distance_px"),
         hypothesis_depth_m=depth_m,
         scene_bits=stack("scene_mask"),
-        overlap=overlap,
+        visible_iou=visible_iou,
         render_colours=render_colours,
         obj_id=stack("obj_id"),
         kept=np.arange(len(samples)),

@@ -1,0 +1,62 @@
+"""Tracking of a sequence, called from Python."""
+
+import pytest
+from posecore.bop import read_results, read_sidecar
+from posecore.errors import ConfigError
+from refinenet.refine import MethodSettings
+from refinenet.tracking.run import TrackJob, track_to_file
+
+from ..refine.test_workers import columns
+from .conftest import FRAMES
+
+
+@pytest.fixture
+def job(scene, still, tmp_path):
+    root, _ = scene
+    method = MethodSettings(checkpoint=still, device="cpu")
+    return TrackJob(method=method, source=root, init=root / "start.csv", out=tmp_path / "job" / "track.csv", threads=1)
+
+
+def test_a_job_writes_the_files_of_the_command(cli, job, tmp_path):
+    calls = []
+    summary = track_to_file(job, lambda done, total: calls.append((done, total)))
+    assert calls == [(i, FRAMES) for i in range(FRAMES + 1)]
+    assert (summary.log.frames, summary.not_reached, summary.stopped) == (FRAMES, 0, None)
+    out = tmp_path / "command" / "track.csv"
+    options = ["--checkpoint", job.method.checkpoint, "--init", job.init, "--out", out, "--device", "cpu"]
+    result = cli("track", job.source, *options, "--threads", 1, "--quiet")
+    assert result.exit_code == 0, result.output
+    assert columns(job.out) == columns(out)
+    assert read_sidecar(job.out) == read_sidecar(out)
+    settings = read_sidecar(out)["settings"]
+    assert (settings["tracking_threshold"], settings["reacquire_threshold"]) == (0.35, 0.2)
+
+
+def test_an_early_end_keeps_the_finished_frames(job):
+    def stop(done, total):
+        if done == 3:
+            raise KeyboardInterrupt
+
+    summary = track_to_file(job, stop)
+    assert isinstance(summary.stopped, KeyboardInterrupt)
+    assert summary.not_reached == read_sidecar(job.out)["not_reached"] == FRAMES - 3
+    assert [estimate.im_id for estimate in read_results(job.out)] == [0, 1, 2]
+
+
+def test_settings_without_effect_are_refused(job):
+    common = {"source": job.source, "out": job.out}
+    edges = MethodSettings(method="edge-icp")
+    with pytest.raises(ConfigError, match="give either --init or --pose"):
+        TrackJob(method=edges, **common)
+    with pytest.raises(ConfigError, match="--depth-step does nothing for --method edge-icp, which has no confidences"):
+        TrackJob(method=edges, init=job.init, depth_step=0.1, **common)
+    search = MethodSettings(method="search", checkpoint=job.method.checkpoint)
+    with pytest.raises(ConfigError, match="--method search takes no --checkpoint"):
+        TrackJob(method=search, init=job.init, **common)
+
+
+@pytest.mark.parametrize(("old", "new"), [("--sure", "--tracking-threshold"), ("--found", "--reacquire-threshold")])
+def test_old_options_are_refused_with_the_new_name(cli, job, old, new):
+    result = cli("track", job.source, "--init", job.init, "--out", job.out, old, 0.5)
+    assert result.exit_code == 2
+    assert f"{old} is now {new}" in result.stderr
