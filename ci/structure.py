@@ -60,7 +60,7 @@ PHRASES = {
     r"\bbackdrop": "background",
 }
 VERBS = r"\b(tells?|told|says?|said|saying|wants?|wanted|knows|knew|looks)\b"
-WITHOUT_NOUN = r"\bof (it|one|them)\b"
+WITHOUT_NOUN = r"\bof (it|them)\b|\bof one\b(?! [a-z])"
 
 
 def main(packages: list[str]) -> int:
@@ -134,7 +134,7 @@ def _names(node: ast.AST) -> Iterator[tuple[str, int]]:
         yield node.id.strip("_"), node.lineno
     elif isinstance(node, ast.arg):
         yield node.arg.strip("_"), node.lineno
-    elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+    elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and ast.unparse(node.value) == "self":
         yield node.attr.strip("_"), node.lineno
 
 

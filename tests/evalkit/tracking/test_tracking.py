@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from evalkit.tables.model import Interval, best_cells
 from evalkit.tracking import (
-    ObjectTrack,
+    SequenceTrack,
     TrackedFile,
     axis_table,
     changes,
@@ -48,7 +48,7 @@ def off(T_gt, R=None, t_m=(0.0, 0.0, 0.0)):
 
 def track(T_est, T_gt, info=None, was_initialised=None, frame=None, time_s=None, name="scene 1, object 5"):
     n = len(T_gt)
-    return ObjectTrack(
+    return SequenceTrack(
         scene_id=1,
         obj_id=5,
         instance=0,

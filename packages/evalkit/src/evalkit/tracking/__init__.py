@@ -12,11 +12,11 @@ from evalkit.tracking.reset_run import ResetRun, ResettableTracker, run_with_res
 from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.scores import TRACKING_DEFINITIONS, track_scores
 from evalkit.tracking.tables import TrackedFile, axis_table, named_tracks, sequence_table
-from evalkit.tracking.tracks import ObjectTrack, frames_of, tracks_of
+from evalkit.tracking.tracks import SequenceTrack, frames_of, tracks_of
 
 __all__ = [
     "TRACKING_DEFINITIONS",
-    "ObjectTrack",
+    "SequenceTrack",
     "ResetRun",
     "ResettableTracker",
     "Residuals",

@@ -9,7 +9,7 @@ from evalkit.inputs.result_files import load_result_files, open_dataset
 from evalkit.tables.model import Table
 from evalkit.tables.writers import require_suffixes, write_tables
 from evalkit.tracking.tables import axis_table, named_tracks, sequence_table
-from evalkit.tracking.tracks import ObjectTrack, frames_of, tracks_of
+from evalkit.tracking.tracks import SequenceTrack, frames_of, tracks_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,5 +64,5 @@ def make_tracking_table(job: TrackingJob) -> tuple[Table, list[Path]]:
     return table, [written for path in job.out for written in write_tables(path, [table])]
 
 
-def _is_scored(track: ObjectTrack, job: TrackingJob) -> bool:
+def _is_scored(track: SequenceTrack, job: TrackingJob) -> bool:
     return (not job.scenes or track.scene_id in job.scenes) and (not job.objects or track.obj_id in job.objects)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
-from evalkit.tracking.tracks import ObjectTrack
+from evalkit.tracking.tracks import SequenceTrack
 
 Array = np.ndarray
 LIMIT_M, LIMIT_RAD = 0.05, np.deg2rad(5.0)
@@ -31,7 +31,7 @@ TRACKING_DEFINITIONS: Mapping[str, str] = {
 }
 
 
-def track_scores(track: ObjectTrack) -> dict[str, float]:
+def track_scores(track: SequenceTrack) -> dict[str, float]:
     """Scores of a track, keys with units; NaN for means over no values.
 
     Args:

@@ -10,7 +10,7 @@ from evalkit.scores.bootstrap import Units, resample
 from evalkit.scores.per_pose import Values
 from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 from evalkit.tracking.scores import ANGLES, AXES, track_scores
-from evalkit.tracking.tracks import ObjectTrack
+from evalkit.tracking.tracks import SequenceTrack
 
 Array = np.ndarray
 
@@ -45,10 +45,10 @@ class TrackedFile:
     """A result file's tracks under its name for readers."""
 
     name: str
-    tracks: list[ObjectTrack]
+    tracks: list[SequenceTrack]
 
 
-def named_tracks(files: Sequence[ResultFile], tracks: Sequence[list[ObjectTrack]]) -> list[TrackedFile]:
+def named_tracks(files: Sequence[ResultFile], tracks: Sequence[list[SequenceTrack]]) -> list[TrackedFile]:
     """Tracks of result files, named by their sidecars."""
     names = method_names(files)
     return [TrackedFile(name=name, tracks=of_file) for name, of_file in zip(names, tracks, strict=True)]
@@ -124,7 +124,7 @@ def _note(tracked: Sequence[TrackedFile]) -> str:
     return " ".join(parts)
 
 
-def _failed_without_reset(track: ObjectTrack) -> int:
+def _failed_without_reset(track: SequenceTrack) -> int:
     scores = track_scores(track)
     return 0 if track.was_initialised is None else int(scores["failed"] - scores["resets"])
 

@@ -19,7 +19,7 @@ Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectTrack:
+class SequenceTrack:
     """One object along one sequence, frames in order.
 
     Attributes:
@@ -55,7 +55,7 @@ def tracks_of(
     table: pd.DataFrame,
     T_est: Float[Array, "n 4 4"],
     T_gt: Float[Array, "n 4 4"],
-) -> list[ObjectTrack]:
+) -> list[SequenceTrack]:
     """The sequences of a result file: one track for each object of each scene.
 
     Args:
@@ -91,7 +91,7 @@ def tracks_of(
             )
         mark = f", instance {instance + 1}" if (scene_id, obj_id) in several else ""
         tracks.append(
-            ObjectTrack(
+            SequenceTrack(
                 scene_id=int(scene_id),
                 obj_id=int(obj_id),
                 instance=int(instance),
