@@ -76,7 +76,7 @@ def networks(size: str, inputs: Inputs) -> dict[str, Network]:
     """All switches on, each off, and on a GPU the paper's design beside them."""
     base = f"--preset plus {BUDGET[size]}" if size == "full" else f"--preset compact {settings(ON)} {BUDGET[size]}"
     pairs = f"--set patch_px={256 if size == 'full' else 128} --set window.padding=0.6 --set hypotheses_per_scene=1"
-    off = {"on-policy": OFF["own-predictions"]} if size == "smoke" else OFF
+    off = {"on-policy": OFF["on-policy"]} if size == "smoke" else OFF
     made = {"all": Network(train=base, pairs=pairs)}
     made |= {f"without-{name}": Network(train=f"{base} {settings(text)}", pairs=pairs) for name, text in off.items()}
     if size == "small":

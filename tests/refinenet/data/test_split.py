@@ -248,7 +248,7 @@ def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(grow
     for timer in later:
         timer.join()
     assert "there are 1 of 3 shards to train on, 0 of 1 scene to validate on" in caplog.text
-    assert "there are 2 of 3 shards to train on, 1 of 1 scene to hold out" in caplog.text
+    assert "there are 2 of 3 shards to train on, 1 of 1 scene to validate on" in caplog.text
     assert set(run.data.training.rows) == {0, 1, 2}
 
 

@@ -8,15 +8,13 @@ from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from refinenet.config import AugmentConfig
 from refinenet.image.crops import warp
 
-Array = np.ndarray
-
 
 def colour(
-    scene_rgb: UInt8[Array, "b p p 3"],
-    hypothesis_rgb: UInt8[Array, "b p p 3"],
+    scene_rgb: UInt8[np.ndarray, "b p p 3"],
+    hypothesis_rgb: UInt8[np.ndarray, "b p p 3"],
     config: AugmentConfig,
     rng: np.random.Generator,
-) -> tuple[UInt8[Array, "b p p 3"], UInt8[Array, "b p p 3"], Float[Array, "b 3 3"]]:
+) -> tuple[UInt8[np.ndarray, "b p p 3"], UInt8[np.ndarray, "b p p 3"], Float[np.ndarray, "b 3 3"]]:
     """Augment colours: of the object in both patches alike, of camera and light in the scene alone.
 
     Args:
@@ -56,20 +54,20 @@ def colour(
     return _to_uint8(scene), _to_uint8(hypothesis), render_colours
 
 
-def _spread(rng: np.random.Generator, b: int, width: float, channels: int = 3) -> Float[Array, "b 1 1 c"]:
+def _spread(rng: np.random.Generator, b: int, width: float, channels: int = 3) -> Float[np.ndarray, "b 1 1 c"]:
     return rng.uniform(1 - width, 1 + width, (b, 1, 1, channels)).astype(np.float32)
 
 
-def _to_uint8(values: Float[Array, "b p p 3"]) -> UInt8[Array, "b p p 3"]:
+def _to_uint8(values: Float[np.ndarray, "b p p 3"]) -> UInt8[np.ndarray, "b p p 3"]:
     return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
 def background_patch(
-    source_rgb: UInt8[Array, "q q 3"] | None,
-    foreground: Bool[Array, "q q"] | None,
+    source_rgb: UInt8[np.ndarray, "q q 3"] | None,
+    foreground: Bool[np.ndarray, "q q"] | None,
     patch_px: int,
     rng: np.random.Generator,
-) -> UInt8[Array, "p p 3"]:
+) -> UInt8[np.ndarray, "p p 3"]:
     """A background for a patch: an enlarged piece of another scene with little foreground, or smooth noise.
 
     Args:
@@ -96,13 +94,13 @@ def background_patch(
 
 
 def occlude(
-    scene_rgb: UInt8[Array, "p p 3"],
-    scene_bits: UInt8[Array, "p p"],
-    source_rgb: UInt8[Array, "q q 3"],
-    source_bits: UInt8[Array, "q q"],
+    scene_rgb: UInt8[np.ndarray, "p p 3"],
+    scene_bits: UInt8[np.ndarray, "p p"],
+    source_rgb: UInt8[np.ndarray, "q q 3"],
+    source_bits: UInt8[np.ndarray, "q q"],
     min_visible_fraction: float,
     rng: np.random.Generator,
-) -> tuple[UInt8[Array, "p p 3"], UInt8[Array, "p p"]]:
+) -> tuple[UInt8[np.ndarray, "p p 3"], UInt8[np.ndarray, "p p"]]:
     """Paste a piece of another scene's foreground over the visible object.
 
     The piece is an elliptic part of the foreground, rotated and scaled: a whole silhouette of the same object would be

@@ -11,11 +11,13 @@ from posecore.window import Window, diameter_window, fixed_window
 
 from refinenet.config import WindowConfig
 
-Array = np.ndarray
-
 
 def hypothesis_window(
-    config: WindowConfig, K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], mesh: Mesh, fixed_side_px: float
+    config: WindowConfig,
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    mesh: Mesh,
+    fixed_side_px: float,
 ) -> Window:
     """The window that inference cuts for a hypothesis.
 
@@ -36,15 +38,20 @@ def fixed_sides_px(objects_card: Mapping[str, Mapping[str, Any]]) -> dict[int, f
     return {int(key): float(entry["window_side_px"]) for key, entry in objects_card.items()}
 
 
-def optical_axis_rotation(angle_rad: float) -> Float[Array, "3 3"]:
+def optical_axis_rotation(angle_rad: float) -> Float[np.ndarray, "3 3"]:
     """Rotation of the scene about the camera's optical axis."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def crop_affine(
-    stored: Window, stored_px: int, K: Float[Array, "3 3"], rotation: Float[Array, "3 3"], window: Window, patch_px: int
-) -> Float[Array, "2 3"]:
+    stored: Window,
+    stored_px: int,
+    K: Float[np.ndarray, "3 3"],
+    rotation: Float[np.ndarray, "3 3"],
+    window: Window,
+    patch_px: int,
+) -> Float[np.ndarray, "2 3"]:
     """Affine map from the stored patch's pixels to the new patch's, both continuous (pixel centre at + 0.5).
 
     Args:
@@ -61,11 +68,11 @@ def crop_affine(
     return np.asarray((patch_from_image @ K @ rotation @ np.linalg.inv(K) @ image_from_stored)[:2])
 
 
-def _similarity(scale: float, dx: float, dy: float) -> Float[Array, "3 3"]:
+def _similarity(scale: float, dx: float, dy: float) -> Float[np.ndarray, "3 3"]:
     return np.array([[scale, 0.0, dx], [0.0, scale, dy], [0.0, 0.0, 1.0]])
 
 
-def warp(image: Array, affine: Float[Array, "2 3"], patch_px: int, nearest: bool = False) -> Array:
+def warp(image: np.ndarray, affine: Float[np.ndarray, "2 3"], patch_px: int, nearest: bool = False) -> np.ndarray:
     """Resample an image by a continuous-pixel affine map; outside, labels are zero and colours are replicated.
 
     A map that shrinks colours blurs them first, as much as `posecore.window.cut` does with "area".
