@@ -7,17 +7,18 @@ Every network sees the same pairs in the same order for the same number of steps
   crop-translation metres in camera axes instead of image-plane shift and depth ratio
   point-loss       contour loss alone
   contour-loss     point loss alone
-  in-plane         scenes are not turned about the optical axis
-  fresh            the hypotheses that were rendered with the pairs
-  own-predictions  drawn hypotheses only
-  confidence       no such output
+  in-plane         scenes are not rotated about the optical axis
+  online           the hypotheses that were rendered with the pairs
+  on-policy        drawn hypotheses only
+  confidence       no confidence output
   background, occlusion, colour   that augmentation is off
-  average          the weights themselves instead of their running average
+  ema              the weights themselves instead of their moving average
 
 `--small` has `paper-choices` beside them: every switch off at once, as in the paper, with the same network. Its
 pairs are rendered as that network takes them, with the renderer's own hypotheses.
 
-Test images are other scenes; starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
+Test images are other scenes; initial poses are the ground truth, rotated by 0 to 20 degrees and translated by 0 to
+0.2 diameters.
 
   --smoke  two networks, 16 training steps: a test of the plumbing
   --small  preset compact with every switch of plus on, the tug, 2 000 rasterised pairs, 3 000 steps of 32, 300 images
@@ -43,8 +44,8 @@ OFF = {
     "point-loss": "loss.name=contour",
     "contour-loss": "loss.name=point",
     "in-plane": "hypothesis.in_plane=false",
-    "fresh": "hypothesis.online=false",
-    "own-predictions": "on_policy.fraction=0",
+    "online": "hypothesis.online=false",
+    "on-policy": "on_policy.fraction=0",
     "confidence": "network.confidence=false",
     "background": "augment.background=0",
     "occlusion": "augment.occlusion=0",
@@ -52,7 +53,7 @@ OFF = {
         "augment.permute_channels=0 augment.gain=0 augment.scene_gain=0 augment.brightness=0 augment.contrast=0"
         " augment.noise=0 augment.blur=0"
     ),
-    "average": "optimiser.ema_decay=0",
+    "ema": "optimiser.ema_decay=0",
 }
 """Settings that turn each switch off."""
 
@@ -75,7 +76,7 @@ def networks(size: str, inputs: Inputs) -> dict[str, Network]:
     """All switches on, each off, and on a GPU the paper's design beside them."""
     base = f"--preset plus {BUDGET[size]}" if size == "full" else f"--preset compact {settings(ON)} {BUDGET[size]}"
     pairs = f"--set patch_px={256 if size == 'full' else 128} --set window.padding=0.6 --set hypotheses_per_scene=1"
-    off = {"own-predictions": OFF["own-predictions"]} if size == "smoke" else OFF
+    off = {"on-policy": OFF["on-policy"]} if size == "smoke" else OFF
     made = {"all": Network(train=base, pairs=pairs)}
     made |= {f"without-{name}": Network(train=f"{base} {settings(text)}", pairs=pairs) for name, text in off.items()}
     if size == "small":
@@ -99,7 +100,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             frames={"smoke": 2, "small": 300, "full": 1000}[size],
             networks=networks(size, inputs),
             baselines=(),
-            starts="--random-up-to 20 --random-translation 0.2",
+            initial="--random-up-to 20 --random-translation 0.2",
             workers=8 if size == "full" else 2,
         ),
     )

@@ -21,7 +21,16 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import ROOT, Step, quoted, words
-from experiments.common import ON_GPUS, Comparison, Experiment, Inputs, compared, full_networks, main, small_networks
+from experiments.common import (
+    TRAINED_MINUTES,
+    Experiment,
+    Inputs,
+    compared,
+    full_networks,
+    main,
+    small_networks,
+    trained_comparison,
+)
 
 TRAINING = {
     "smoke": "--steps 16 --batch 8 --set validation.pairs=16 --threads 1",
@@ -47,16 +56,14 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
         make,
         *compared(
             work,
-            Comparison(
+            trained_comparison(
+                size,
+                inputs,
                 objects=f"--object {cups}/train",
                 tested=f"--object {cups}/unseen",
-                scenes=f"--preset category --engine {'cycles' if full else 'raster'} {inputs.behind()}",
-                pairs={"smoke": 120, "small": 3000, "full": 200_000}[size],
-                frames={"smoke": 2, "small": 60, "full": 1000}[size],
+                preset="category",
                 networks=networks,
-                starts="--random-up-to 20 --random-translation 0.2",
-                workers=8 if full else 2,
-                render=ON_GPUS if full else "--workers 2",
+                smoke_pairs=120,
             ),
         ),
     ]
@@ -66,11 +73,7 @@ EXPERIMENT = Experiment(
     name=Path(__file__).stem,
     doc=__doc__,
     paper={"unseen members": "tracked, without figures"},
-    minutes={
-        "smoke": "two minutes on two CPU cores",
-        "small": "a quarter of an hour on two CPU cores",
-        "full": "a day, most of it rendering; a GPU",
-    },
+    minutes=TRAINED_MINUTES,
     plan=plan,
 )
 

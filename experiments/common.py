@@ -1,4 +1,4 @@
-"""What the experiments share: sizes, networks and methods to compare, and the chain from meshes to a report."""
+"""Common parts of the experiments: sizes, networks and methods to compare, and the chain from meshes to a report."""
 
 import argparse
 import json
@@ -35,7 +35,7 @@ class Inputs:
     """What the user has beside this repository.
 
     Attributes:
-        data: LM-O in BOP layout: `models/`, `test/`, `test_targets_bop19.json`, and start poses.
+        data: LM-O in BOP layout: `models/`, `test/`, `test_targets_bop19.json`, and initial poses.
         backbone_weights: ImageNet weights of InceptionV3's stem; without them preset `paper` has its own stem's.
         backgrounds: Folder of photographs to put behind objects.
         hdris: Folder of panoramas to light scenes with.
@@ -52,13 +52,13 @@ class Inputs:
         Raises:
             SystemExit: There is none.
         """
-        found = None if self.data is None else self.data / "models"
-        if found is None or not (found / "models_info.json").is_file():
+        models = None if self.data is None else self.data / "models"
+        if models is None or not (models / "models_info.json").is_file():
             raise SystemExit(
-                f"Error: no LM-O meshes: found {'no --data' if found is None else f'no {found}/models_info.json'}, "
+                f"Error: no LM-O meshes: found {'no --data' if models is None else f'no {models}/models_info.json'}, "
                 "expected --data FOLDER with models/, test/ and test_targets_bop19.json as BOP publishes them"
             )
-        return found
+        return models
 
     def stem(self) -> str:
         """Options of `refinenet train` for the frozen stem of preset `paper`."""
@@ -86,13 +86,13 @@ class Network:
     Attributes:
         train: Options of `refinenet train`.
         pairs: Options of `synthgen render` for its training pairs beside those of the experiment.
-        share: Its number of pairs is that of the experiment divided by this.
-        checkpoint: Taken as it is, instead of training.
+        pairs_divisor: Divisor of the experiment's number of pairs.
+        checkpoint: Trained network; None trains one.
     """
 
     train: str = ""
     pairs: str = ""
-    share: int = 1
+    pairs_divisor: int = 1
     checkpoint: Path | None = None
 
 
@@ -118,12 +118,12 @@ def full_networks(inputs: Inputs) -> dict[str, Network]:
     losses = ("mse", "contour-forward", "contour")
     networks = {loss: Network(train=f"--preset paper --loss {loss} {inputs.stem()}") for loss in losses}
     wide = "--set window.padding=0.6 --set hypotheses_per_scene=1"
-    return networks | {"plus": Network(train="--preset plus", pairs=wide, share=HYPOTHESES_PER_SCENE)}
+    return networks | {"plus": Network(train="--preset plus", pairs=wide, pairs_divisor=HYPOTHESES_PER_SCENE)}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """Refinement methods side by side, from the same start poses.
+    """Refinement methods side by side, from the same initial poses.
 
     Attributes:
         objects: Options of `synthgen` that name the meshes.
@@ -133,10 +133,10 @@ class Comparison:
         frames: Rendered test images.
         networks: By the name in the report.
         baselines: Methods without a network.
-        starts: Options of `evalkit perturb`.
+        initial: Options of `evalkit perturb`.
         iterations: Of `refinenet refine`, the same for all methods.
         dataset: Real test images, instead of rendered ones.
-        init: Start poses for them, instead of perturbed ones.
+        init: Initial poses for them, instead of perturbed ones.
         workers: Processes that render test images.
         render: Options of `synthgen render` that say where it runs.
         tested: Options of `synthgen` that name the meshes in test images, where those are others.
@@ -149,7 +149,7 @@ class Comparison:
     frames: int = 0
     networks: Mapping[str, Network]
     baselines: tuple[str, ...] = tuple(BASELINES)
-    starts: str = ""
+    initial: str = ""
     iterations: int = 5
     dataset: Path | None = None
     init: Path | None = None
@@ -158,25 +158,74 @@ class Comparison:
     tested: str | None = None
 
 
+def lmo_comparison(inputs: Inputs, frames: int, initial: str, iterations: int = 5) -> Comparison:
+    """Size `full` on LM-O's meshes: networks of the paper for each object, 200 000 path-traced pairs each."""
+    return Comparison(
+        objects=f"--object {quoted(inputs.models())}",
+        each=lmo_meshes(inputs),
+        scenes=f"--preset linemod --engine cycles {inputs.behind()}",
+        pairs=200_000,
+        frames=frames,
+        networks=full_networks(inputs),
+        initial=initial,
+        iterations=iterations,
+        workers=8,
+        render=ON_GPUS,
+    )
+
+
+def trained_comparison(
+    size: str,
+    inputs: Inputs,
+    *,
+    objects: str,
+    preset: str,
+    networks: Mapping[str, Network],
+    smoke_pairs: int,
+    tested: str | None = None,
+) -> Comparison:
+    """Networks trained at every size, path-traced at size `full`; up to 20 degrees and 0.2 diameters of error."""
+    full = size == "full"
+    return Comparison(
+        objects=objects,
+        tested=tested,
+        scenes=f"--preset {preset} --engine {'cycles' if full else 'raster'} {inputs.behind()}",
+        pairs={"smoke": smoke_pairs, "small": 3000, "full": 200_000}[size],
+        frames={"smoke": 2, "small": 60, "full": 1000}[size],
+        networks=networks,
+        initial="--random-up-to 20 --random-translation 0.2",
+        workers=8 if full else 2,
+        render=ON_GPUS if full else "--workers 2",
+    )
+
+
+TRAINED_MINUTES = {
+    "smoke": "two minutes on two CPU cores",
+    "small": "a quarter of an hour on two CPU cores",
+    "full": "a day, most of it rendering; a GPU",
+}
+"""Duration of a `trained_comparison` by size."""
+
+
 def compared(work: Path, what: Comparison) -> list[Step]:
-    """The chain of a comparison: pairs, networks, test images, start poses, every method's poses, tables, report."""
+    """The chain of a comparison: pairs, networks, test images, initial poses, every method's poses, tables, report."""
     folder = quoted(work)
     dataset = f"{folder}/test_bop" if what.dataset is None else quoted(what.dataset)
-    init = f"{folder}/results/start.csv" if what.init is None else quoted(what.init)
+    init = f"{folder}/results/initial.csv" if what.init is None else quoted(what.init)
     steps = [*trainings(work, what)]
     if what.dataset is None:
         steps.append(
             rendered_frames(work, what.tested or what.objects, f"{what.scenes} --workers {what.workers}", what.frames)
         )
     if what.init is None:
-        steps.append(start_poses(work, what.starts))
+        steps.append(initial_poses(work, what.initial))
     refine = f"refinenet refine --dataset {dataset} --init {init} --iterations {what.iterations} --keep-failed"
     results = []
     for name, network in what.networks.items():
         steps += refinements(work, what, refine, name, network)
         results.append(name)
     for name in what.baselines:
-        steps.append(refinement(work, f"{refine} --method {name}", name, f"The same starts, refined by {name}."))
+        steps.append(refinement(work, f"{refine} --method {name}", name, f"The same initial poses, refined by {name}."))
         results.append(name)
     named = " ".join(f"--results {path}" for path in [init, *(f"{folder}/results/{name}.csv" for name in results)])
     steps.append(
@@ -194,15 +243,15 @@ def compared(work: Path, what: Comparison) -> list[Step]:
 
 
 def trainings(work: Path, what: Comparison) -> Iterator[Step]:
-    """Render the pairs that networks train on and train them; networks of the same pairs share them."""
+    """Render training pairs and train the networks; networks with the same options use the same pairs."""
     folder = quoted(work)
     trained = {name: network for name, network in what.networks.items() if network.checkpoint is None}
-    kinds = list(dict.fromkeys((network.pairs, network.share) for network in trained.values()))
+    kinds = list(dict.fromkeys((network.pairs, network.pairs_divisor) for network in trained.values()))
     shards = {kind: f"shards{number or ''}" for number, kind in enumerate(kinds)}
     groups = {f"_{number:06d}": (f", object {number}", mesh) for number, mesh in what.each.items()}
     for group, (which, objects) in (groups or {"": ("", what.objects)}).items():
-        for (options, share), name in shards.items():
-            render = f"synthgen render {objects} {what.scenes} {options} --n {what.pairs // share} --seed 1"
+        for (options, divisor), name in shards.items():
+            render = f"synthgen render {objects} {what.scenes} {options} --n {what.pairs // divisor} --seed 1"
             yield Step(
                 name=f"{name}{group}",
                 why=f"Training pairs{which}, from meshes alone.",
@@ -210,7 +259,8 @@ def trainings(work: Path, what: Comparison) -> Iterator[Step]:
                 leaves=f"{name}{group}/manifest.jsonl",
             )
         for name, network in trained.items():
-            train = f"refinenet train {folder}/{shards[network.pairs, network.share]}{group} {network.train} --seed 0"
+            source = shards[network.pairs, network.pairs_divisor]
+            train = f"refinenet train {folder}/{source}{group} {network.train} --seed 0"
             yield Step(
                 name=f"train-{name}{group}",
                 why=f"Network '{name}'{which}.",
@@ -230,12 +280,12 @@ def rendered_frames(work: Path, objects: str, options: str, frames: int, out: st
     )
 
 
-def start_poses(work: Path, options: str, dataset: str = "test_bop", name: str = "start") -> Step:
-    """Start poses: ground truth, perturbed."""
+def initial_poses(work: Path, options: str, dataset: str = "test_bop", name: str = "initial") -> Step:
+    """Initial poses: ground truth, perturbed."""
     folder = quoted(work)
     return Step(
         name=f"{name}-poses",
-        why="Start poses: ground truth, perturbed.",
+        why="Initial poses: ground truth, perturbed.",
         command=words(
             f"evalkit perturb --dataset {folder}/{dataset} {options} --seed 103 --out {folder}/results/{name}.csv"
         ),

@@ -23,43 +23,31 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
-    ON_GPUS,
     SHIPPED,
     TUG,
     Comparison,
     Experiment,
     Inputs,
     compared,
-    full_networks,
-    lmo_meshes,
+    lmo_comparison,
     main,
 )
 
 FRAMES = {"smoke": 2, "small": 60, "full": 800}
-STARTS = "--random-up-to 56 --random-translation 0.3"
+INITIAL_POSES = "--random-up-to 56 --random-translation 0.3"
 
 
 def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     if size == "full":
-        what = Comparison(
-            objects=f"--object {quoted(inputs.models())}",
-            each=lmo_meshes(inputs),
-            scenes=f"--preset linemod --engine cycles {inputs.behind()}",
-            pairs=200_000,
-            frames=FRAMES[size],
-            networks=full_networks(inputs),
-            starts=STARTS,
-            workers=8,
-            render=ON_GPUS,
-        )
+        what = lmo_comparison(inputs, FRAMES[size], INITIAL_POSES)
     else:
         what = Comparison(
             objects=f"--object {quoted(TUG)}",
             scenes=f"--preset linemod --engine raster {inputs.behind()}",
             frames=FRAMES[size],
             networks=SHIPPED,
-            starts=STARTS,
+            initial=INITIAL_POSES,
         )
     return compared(work, what)
 

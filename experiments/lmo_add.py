@@ -5,7 +5,7 @@ at a tenth of the diameter (ADD-S for symmetric objects). The paper: 6.2 to 27.5
 24.36 deg; errors in x, y and z of 13.7, 13.4 and 77.5 mm become 8.5, 9.0 and 49.1 mm.
 
 Networks learn from rendered pairs of the meshes alone. The real frames are for testing, never for tuning: nothing in
-this file was chosen by a result on them. Start poses are the result file `init*.csv` in --data.
+this file was chosen by a result on them. Initial poses are the result file `init*.csv` in --data.
 
   --smoke  16 training steps: a test of the plumbing
   --small  preset compact, one network over all objects, with each loss, 6 000 rasterised pairs; with
@@ -37,8 +37,8 @@ from experiments.common import (
     small_networks,
 )
 
-# As far as the start poses of the paper are off in the mean: 34 degrees, a tenth of a diameter across the image and six
-# times as much in depth.
+# Mean errors of the paper's initial poses: 34 degrees, a tenth of a diameter across the image and six times as much in
+# depth.
 REACH = (
     "--set hypothesis.max_angle_deg=45 --set hypothesis.max_translation_diameter=0.25 --set hypothesis.depth_stretch=6"
 )
@@ -52,7 +52,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     models, data = inputs.models(), inputs.data
     assert data is not None
-    init = start_poses_of(data)
+    init = initial_poses_file(data)
     full = size == "full"
     networks = full_networks(inputs)
     if not full:
@@ -77,16 +77,18 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     )
 
 
-def start_poses_of(data: Path) -> Path:
-    """The result file of start poses that lies beside the images.
+def initial_poses_file(data: Path) -> Path:
+    """The result file of initial poses that lies beside the images.
 
     Raises:
         SystemExit: There is none, or several.
     """
-    found = sorted(data.glob("init*.csv"))
-    if len(found) != 1:
-        raise SystemExit(f"Error: {data}: found {len(found)} files init*.csv, expected one result file of start poses")
-    return found[0]
+    files = sorted(data.glob("init*.csv"))
+    if len(files) != 1:
+        raise SystemExit(
+            f"Error: {data}: found {len(files)} files init*.csv, expected one result file of initial poses"
+        )
+    return files[0]
 
 
 def has_depth(data: Path) -> bool:

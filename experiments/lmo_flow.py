@@ -2,7 +2,7 @@
 
 The network learns twice: from rendered pairs, and then from what `search` weighs with it, in frames that stand in for
 real ones (`stand_ins.py`): it is as good as its judge, and those are what a judge has to tell apart. LM-O's
-real frames are for testing only; their start poses are the result file `init*.csv` in --data.
+real frames are for testing only; their initial poses are the result file `init*.csv` in --data.
 
   --smoke  a few steps on a few pairs, one object: a test of the plumbing
   --small  9 600 path-traced pairs, 210 frames
@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import ROOT, Step, quoted, words
 from experiments.common import ON_GPUS, Experiment, Inputs, main, refinement, report
 from experiments.lmo_add import EXPERIMENT as PROTOCOL
-from experiments.lmo_add import start_poses_of
+from experiments.lmo_add import initial_poses_file
 
 SETS = (17, 18, 19)
 """Seeds of the sets of frames, each of other altered meshes."""
@@ -31,7 +31,7 @@ FRAMES = (
     "--set tabletop.size_diameter=[6,10] --set tabletop.distractors=[2,5] --set tabletop.elevation_deg=[12,50]"
 )
 """Crowded, so that half of the objects are hidden in part."""
-STARTS = "--random-up-to 65 --random-translation 0.3 --depth-stretch 6"
+INITIAL_POSES = "--random-up-to 65 --random-translation 0.3 --depth-stretch 6"
 LOADER = "--threads 1 --set loader.cache_mb=6000 --set validation.scene_fraction=0.04"
 MISTAKES = "--set hypothesis.precomputed_fraction=0.5 --set loss.min_pose_quality=0.02 --set loader.shuffle_shards=32"
 
@@ -100,7 +100,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     models, chosen, folder = inputs.models(), SIZES[size], quoted(work)
     assert inputs.data is not None
-    data, init = quoted(inputs.data), quoted(start_poses_of(inputs.data))
+    data, init = quoted(inputs.data), quoted(initial_poses_file(inputs.data))
     lights = "" if inputs.hdris is None else f"--hdris {quoted(inputs.hdris)}"
     named = quoted(models)
     steps = [
@@ -183,7 +183,7 @@ def script(arguments: str) -> tuple[str, ...]:
 
 
 def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> Iterator[Step]:
-    """Frames of altered meshes, start poses in them, what `search` weighs from those, and the pairs cut out there."""
+    """Frames of altered meshes, initial poses in them, what `search` weighs from those, and the pairs cut out there."""
     folder, named = quoted(work), quoted(models)
     frames, altered, start = (f"{folder}/{name}{seed}" for name in ("frames", "altered", "start"))
     yield Step(
@@ -209,8 +209,8 @@ def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> It
     )
     yield Step(
         name=f"start{seed}",
-        why="Start poses that err most in depth.",
-        command=words(f"evalkit perturb --dataset {frames} {STARTS} --seed {seed} --out {start}.csv"),
+        why="Initial poses that err most in depth.",
+        command=words(f"evalkit perturb --dataset {frames} {INITIAL_POSES} --seed {seed} --out {start}.csv"),
         leaves=f"start{seed}.csv",
     )
     yield Step(

@@ -6,7 +6,8 @@ region-based one 0.304.
 
 Here the objects are the two that ship: the tug, without a symmetry, and the bobbin, which looks the same however it is
 turned about its axis, so that its rotation cannot be regressed. One network serves both. Test images are other scenes,
-starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
+initial poses are the ground truth, rotated by 0 to 20 degrees and translated by 0 to 0.2
+diameters.
 
   --smoke  16 training steps: a test of the plumbing
   --small  preset compact with each loss, 3 000 rasterised pairs, 1 500 steps, 60 images
@@ -23,15 +24,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
     BOBBIN,
-    ON_GPUS,
+    TRAINED_MINUTES,
     TUG,
-    Comparison,
     Experiment,
     Inputs,
     compared,
     full_networks,
     main,
     small_networks,
+    trained_comparison,
 )
 
 TRAINING = {
@@ -46,15 +47,13 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     info = TUG.with_name("models_info.json")
     return compared(
         work,
-        Comparison(
+        trained_comparison(
+            size,
+            inputs,
             objects=f"--object {quoted(TUG)} --object {quoted(BOBBIN)} --models-info {quoted(info)}",
-            scenes=f"--preset tejani --engine {'cycles' if full else 'raster'} {inputs.behind()}",
-            pairs={"smoke": 128, "small": 3000, "full": 200_000}[size],
-            frames={"smoke": 2, "small": 60, "full": 1000}[size],
+            preset="tejani",
             networks=full_networks(inputs) if full else small_networks(TRAINING[size], losses),
-            starts="--random-up-to 20 --random-translation 0.2",
-            workers=8 if full else 2,
-            render=ON_GPUS if full else "--workers 2",
+            smoke_pairs=128,
         ),
     )
 
@@ -63,11 +62,7 @@ EXPERIMENT = Experiment(
     name=Path(__file__).stem,
     doc=__doc__,
     paper={"VSS": "contour loss 0.817, MSE 0.676 (RGB-D tracker 0.627, region tracker 0.304)"},
-    minutes={
-        "smoke": "two minutes on two CPU cores",
-        "small": "a quarter of an hour on two CPU cores",
-        "full": "a day, most of it rendering; a GPU",
-    },
+    minutes=TRAINED_MINUTES,
     plan=plan,
 )
 

@@ -25,15 +25,13 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
 from experiments.common import (
-    ON_GPUS,
     SHIPPED,
     TUG,
     Comparison,
     Experiment,
     Inputs,
     compared,
-    full_networks,
-    lmo_meshes,
+    lmo_comparison,
     main,
 )
 
@@ -44,22 +42,7 @@ PROTOCOL = "--protocol paper"
 def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     """Commands for a size."""
     if size == "full":
-        each = lmo_meshes(inputs)
-        return compared(
-            work,
-            Comparison(
-                objects=f"--object {quoted(inputs.models())}",
-                each=each,
-                scenes=f"--preset linemod --engine cycles {inputs.behind()}",
-                pairs=200_000,
-                frames=FRAMES[size],
-                networks=full_networks(inputs),
-                starts=PROTOCOL,
-                iterations=10,
-                workers=8,
-                render=ON_GPUS,
-            ),
-        )
+        return compared(work, lmo_comparison(inputs, FRAMES[size], PROTOCOL, iterations=10))
     return compared(
         work,
         Comparison(
@@ -67,7 +50,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             scenes=f"--preset quickstart --engine raster {inputs.behind()}",
             frames=FRAMES[size],
             networks=SHIPPED,
-            starts="--angles 15,45 --translations 0.2" if size == "smoke" else PROTOCOL,
+            initial="--angles 15,45 --translations 0.2" if size == "smoke" else PROTOCOL,
             iterations=10,
         ),
     )

@@ -39,7 +39,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             pairs=128,
             frames={"smoke": 2, "small": 30, "full": 200}[size],
             networks=networks,
-            starts="--random-up-to 20 --random-translation 0.2",
+            initial="--random-up-to 20 --random-translation 0.2",
             iterations=1,
         ),
     )
@@ -48,7 +48,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
 def measured(work: Path) -> dict[str, Any]:
     """Median milliseconds of one iteration by method."""
     files = sorted((work / "results").glob("*.csv"))
-    return {"ms_per_iteration": {file.stem: median_ms(file) for file in files if file.stem != "start"}}
+    return {"ms_per_iteration": {file.stem: median_ms(file) for file in files if file.stem != "initial"}}
 
 
 EXPERIMENT = Experiment(

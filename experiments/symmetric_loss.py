@@ -7,7 +7,8 @@ them around any of the poses that look like the truth, as detectors give them.
 VSS, the overlap of the silhouettes of estimate and truth, is what can be right here; the paper reports it as 0.817
 against 0.676 on the objects of Tejani et al., most of which are symmetric.
 
-Test images are other scenes; starts the truth turned by 0 to 20 degrees and moved by 0 to 0.2 diameters.
+Test images are other scenes; initial poses are the ground truth, rotated by 0 to 20 degrees and translated by 0 to
+0.2 diameters.
 
   --smoke  16 training steps: a test of the plumbing
   --small  preset compact with each loss, with and without any-twin, 2 000 rasterised pairs, 3 000 steps, 300 images
@@ -48,7 +49,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             frames={"smoke": 2, "small": 300, "full": 1000}[size],
             networks=chosen,
             baselines=(),
-            starts="--random-up-to 20 --random-translation 0.2",
+            initial="--random-up-to 20 --random-translation 0.2",
             workers=8 if full else 2,
         ),
     )

@@ -6,7 +6,7 @@ pose of the one before; root mean squares of the errors along and about each axi
 
 Here sequences are rendered. The first frame starts from the truth turned by up to 2 degrees and moved by up to 0.02
 diameters; so does a later one whose object was lost in the frames before, which is counted as a reset. Those perturbed
-poses of all frames are the row `start` of the report; a tracker sees no other of them.
+poses of all frames are the row `initial` of the report; a tracker sees no other of them.
 
   --smoke  the example object, its shipped checkpoints, 1 sequence of 6 images: a test of the plumbing
   --small  the same with 2 sequences of 100 images; nothing is trained
@@ -33,11 +33,11 @@ from experiments.common import (
     Experiment,
     Inputs,
     full_networks,
+    initial_poses,
     joined,
     main,
     rendered_frames,
     report,
-    start_poses,
     trainings,
 )
 
@@ -62,7 +62,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
     steps = [
         *trainings(work, what),
         rendered_frames(work, what.objects, options, frames),
-        start_poses(work, "--random-up-to 2 --random-translation 0.02"),
+        initial_poses(work, "--random-up-to 2 --random-translation 0.02"),
     ]
     for name, network in what.networks.items():
         checkpoint = (
@@ -76,7 +76,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
                     why=f"Sequence {scene}, tracked by network '{name}'.",
                     command=words(
                         f"refinenet track {folder}/test_bop --scene {scene} --checkpoint {checkpoint}"
-                        f" --init {folder}/results/start.csv --name {name} --out {folder}/parts/{part}.csv"
+                        f" --init {folder}/results/initial.csv --name {name} --out {folder}/parts/{part}.csv"
                     ),
                     leaves=f"parts/{part}.csv",
                 )
@@ -93,13 +93,13 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             leaves="tracking.json",
         )
     )
-    steps.append(report(work, f"{dataset} --results {folder}/results/start.csv {results}"))
+    steps.append(report(work, f"{dataset} --results {folder}/results/initial.csv {results}"))
     return steps
 
 
 def measured(work: Path) -> dict[str, Any]:
     """The tracking table, and how often each network's track was reset."""
-    files = [path for path in (work / "results").glob("*.csv.json") if path.name != "start.csv.json"]
+    files = [path for path in (work / "results").glob("*.csv.json") if path.name != "initial.csv.json"]
     resets = {path.name.removesuffix(".csv.json"): json.loads(path.read_text(encoding="utf-8")) for path in files}
     return {
         "tracking": json.loads((work / "tracking.json").read_text(encoding="utf-8")),

@@ -201,8 +201,8 @@ def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     assert first.returncode == 0, first.stdout + first.stderr
     result = json.loads((tmp_path / "work" / "result.json").read_text())
     assert (tmp_path / "work" / "report" / "index.html").is_file()
-    assert set(result["methods"]) == {"start", *common.SHIPPED, *common.BASELINES}
-    assert result["methods"]["start"]["vss_mean"] < result["methods"]["shipped"]["vss_mean"]
+    assert set(result["methods"]) == {"initial", *common.SHIPPED, *common.BASELINES}
+    assert result["methods"]["initial"]["vss_mean"] < result["methods"]["shipped"]["vss_mean"]
     levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
     assert levels[-1] == 45
     assert all(step["seconds"] > 0 for step in result["steps"])
@@ -215,19 +215,19 @@ def test_every_method_starts_from_the_same_poses_and_is_in_the_report(tmp_path) 
         frames=2,
         networks={"net": common.SHIPPED["shipped"]},
         baselines=("edge-icp",),
-        starts="--angles 5",
+        initial="--angles 5",
     )
     *_, net, edge, tables, report = common.compared(tmp_path, what)
     words = [[word for word in step.command if word != "--keep-failed"] for step in (net, edge)]
     assert [len(step.command) - len(kept) for step, kept in zip((net, edge), words, strict=True)] == [1, 1]
     options = [dict(zip(kept[2::2], kept[3::2], strict=True)) for kept in words]
-    start = str(tmp_path / "results" / "start.csv")
-    assert [each["--init"] for each in options] == [start, start]
+    initial = str(tmp_path / "results" / "initial.csv")
+    assert [each["--init"] for each in options] == [initial, initial]
     assert [each.get("--method") for each in options] == [None, "edge-icp"]
     assert [each.get("--checkpoint") is None for each in options] == [False, True]
     for step in (tables, report):
         named = [word for before, word in itertools.pairwise(step.command) if before == "--results"]
-        assert named == [start, options[0]["--out"], options[1]["--out"]]
+        assert named == [initial, options[0]["--out"], options[1]["--out"]]
 
 
 def test_parts_join_into_one_result_file(tmp_path) -> None:

@@ -120,7 +120,7 @@ def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, mo
     with caplog.at_level(logging.WARNING):
         train(small("loader.follow=true", "steps=30", "batch=4"), str(url), tmp_path / "run")
     rendering.join()
-    assert "there are 0 of 1 shards to train on, 0 of 1 scene to hold out" in caplog.text
+    assert "there are 0 of 1 shards to train on, 0 of 1 scene to validate on" in caplog.text
     joined = [json.loads(path.read_text())["shards"] for path in sorted((tmp_path / "run/growth").iterdir())]
     assert any(joined)
     validation_scenes_now = json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"]
@@ -247,8 +247,8 @@ def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(grow
         run = open_run(small(*options), str(url), tmp_path / "run")
     for timer in later:
         timer.join()
-    assert "there are 1 of 3 shards to train on, 0 of 1 scene to hold out" in caplog.text
-    assert "there are 2 of 3 shards to train on, 1 of 1 scene to hold out" in caplog.text
+    assert "there are 1 of 3 shards to train on, 0 of 1 scene to validate on" in caplog.text
+    assert "there are 2 of 3 shards to train on, 1 of 1 scene to validate on" in caplog.text
     assert set(run.data.training.rows) == {0, 1, 2}
 
 

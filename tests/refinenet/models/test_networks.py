@@ -251,7 +251,7 @@ def test_no_hub_is_a_one_line_error_that_names_both_ways(monkeypatch, caplog):
 def test_training_options_are_checked():
     with pytest.raises(ConfigError, match=r"unknown key optimiser.momentum"):
         load_config("compact", ["optimiser.momentum=0.9"])
-    with pytest.raises(ConfigError, match=r"patch_px is 64: kind=paper is built for 224"):
+    with pytest.raises(ConfigError, match=r"patch_px is 64, expected 224 for kind=paper"):
         load_config("paper", ["network.patch_px=64"])
     with pytest.raises(ConfigError, match="unknown preset 'minus'"):
         load_config("minus")
@@ -259,7 +259,7 @@ def test_training_options_are_checked():
         ConfigError, match=r"augment.occlusion needs pairs made in the training loop: window.kind=diameter"
     ):
         load_config("paper", ["augment.occlusion=0.5"])
-    with pytest.raises(ConfigError, match=r"begin is 0.7, expected 0 to full, which is 0.5"):
+    with pytest.raises(ConfigError, match=r"begin is 0.7, expected at most full, which is 0.5"):
         load_config("compact", ["on_policy.begin=0.7"])
     with pytest.raises(ConfigError, match=r"patch_px is 72, expected a multiple of 32 for kind=plus"):
         load_config("plus", ["network.patch_px=72"])

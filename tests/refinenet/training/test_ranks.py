@@ -37,7 +37,7 @@ def test_two_ranks_learn_what_one_process_learns_with_the_doubled_batch(dataset,
     options = [*SMALL, "precision=float32", "optimiser.ema_decay=0.9"]
     result = torchrun(dataset, tmp_path / "two", *settings([*options, f"optimiser.accumulate={accumulate}"]))
     assert result.returncode == 0, result.stderr[-2000:]
-    assert result.stdout.count("start  refined") == 1
+    assert result.stdout.count("initial  refined") == 1
     alone = [f"optimiser.accumulate={2 * accumulate}", "loader.workers=2", "precision=float32"]
     train(small(*alone, "optimiser.ema_decay=0.9"), str(dataset), tmp_path / "one")
     two, one = (curve(tmp_path / name, "loss_px") for name in ("two", "one"))

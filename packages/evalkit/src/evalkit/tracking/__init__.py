@@ -16,10 +16,10 @@ from evalkit.tracking.tracks import SequenceTrack, frames_of, tracks_of
 
 __all__ = [
     "TRACKING_DEFINITIONS",
-    "SequenceTrack",
     "ResetRun",
     "ResettableTracker",
     "Residuals",
+    "SequenceTrack",
     "TrackedFile",
     "TrackingJob",
     "axis_table",

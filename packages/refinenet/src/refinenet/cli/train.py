@@ -43,11 +43,11 @@ log = logging.getLogger(__name__)
 @click.option(
     "--backbone-weights", type=FILE, metavar="FILE", help="ImageNet weights of preset paper's stem (safetensors)."
 )
-@click.option("--init", type=FILE, metavar="FILE", help="Checkpoint whose weights the run begins with.")
+@click.option("--init", type=FILE, metavar="FILE", help="Checkpoint with the initial weights.")
 @click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
-@click.option("--resume", is_flag=True, help="Go on with the run in --out.")
-@click.option("--follow", is_flag=True, help="SHARDS is being rendered, or will be: take new shards in between epochs.")
-@click.option("--skip-bad-shards", is_flag=True, help="Train without shards that cannot be read; each is named.")
+@click.option("--resume", is_flag=True, help="Continue the run in --out.")
+@click.option("--follow", is_flag=True, help="SHARDS is still being rendered: add new shards between epochs.")
+@click.option("--skip-bad-shards", is_flag=True, help="Train without unreadable shards; each is reported.")
 @quiet_option
 @verbose_option
 def train(
@@ -90,7 +90,7 @@ def train(
     named = {
         "steps": steps, "batch": batch, "loss.name": loss, "seed": seed, "loader.workers": workers, "threads": threads,
         "device": device, "loader.follow": follow or None, "loader.skip_bad_shards": skip_bad_shards or None,
-        # quoted: a path may hold what YAML reads as a comment
+        # quoted: a path may contain what YAML reads as a comment
         "network.backbone.weights": None if backbone_weights is None else json.dumps(str(backbone_weights)),
         "objects": list(objects) or None,
         "init": None if init is None else json.dumps(str(init)),
@@ -105,25 +105,25 @@ def train(
     ):
         errors = run(config, shards, folder, resume=resume, report=report)
     if errors:  # under torchrun, rank 0 has them
-        for line in (*_comparison(errors), *_which(folder, config.steps)):
+        for line in (*_comparison(errors), *_checkpoints(folder, config.steps)):
             click.echo(line)
         click.echo(f"{folder / 'best.safetensors'}")
 
 
 def _comparison(errors: dict[str, float]) -> Iterator[str]:
-    """Held-out errors, start beside refined."""
+    """Validation errors before and after one update."""
     rows = (
         ("rotation, mean", "rotation", "deg"), ("rotation, median", "rotation_median", "deg"),
         ("x", "x", "mm"), ("y", "y", "mm"), ("z", "z", "mm"), ("points (ADD)", "add", "mm"),
     )  # fmt: skip
-    yield "held-out scenes, one update    start  refined"
+    yield "validation, one update       initial  refined"
     for label, key, unit in rows:
         before, after = errors[f"validation/{key}_before_{unit}"], errors[f"validation/{key}_after_{unit}"]
         yield f"{label + ', ' + unit:<26}{before:10.2f}{after:9.2f}"
 
 
-def _which(folder: Path, steps: int) -> Iterator[str]:
-    """Of which of a run's two checkpoints the table is."""
+def _checkpoints(folder: Path, steps: int) -> Iterator[str]:
+    """Which of the run's two checkpoints the table belongs to."""
     from refinenet.models import checkpoint
 
     best = checkpoint.load(folder / "best.safetensors").provenance.step
@@ -131,9 +131,9 @@ def _which(folder: Path, steps: int) -> Iterator[str]:
         yield f"of step {steps}: last.safetensors, and best.safetensors too"
         return
     yield f"of step {steps}: last.safetensors"
-    measured = (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
+    lines = (json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
     key = "validation/add_after_mm"
-    add_mm = [line[key] for line in measured if line["step"] == best and key in line]
+    add_mm = [line[key] for line in lines if line["step"] == best and key in line]
     yield f"best.safetensors is of step {best}" + "".join(f", points (ADD) {value:.2f} mm" for value in add_mm[-1:])
 
 
@@ -144,15 +144,15 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
     task: TaskID = bar.add_task("steps", total=steps, state="first batches")
 
     def report(step: int, values: dict[str, float]) -> None:
-        bar.start()  # at the first report, not before: an error in settings or data comes out on a line of its own
+        bar.start()  # at the first report: an error in settings or data stays on a line of its own
         if "validation/add_after_mm" in values:
             if not quiet:
-                move = "  ".join(
+                change = "  ".join(
                     f"{key} {values[f'validation/{key}_before_{unit}']:.2f} -> "
                     f"{values[f'validation/{key}_after_{unit}']:.2f} {unit}"
                     for key, unit in (("rotation", "deg"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("add", "mm"))
                 )
-                bar.console.print(f"step {step}  {move}", highlight=False, soft_wrap=True)
+                bar.console.print(f"step {step}  {change}", highlight=False, soft_wrap=True)
             return
         loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss"))
         wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_fraction']:.0f} %)"
@@ -169,7 +169,7 @@ def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
 
 @contextmanager
 def _quiet_threads() -> Iterator[None]:
-    """TensorBoard's writing thread hands its error to the training thread, which reports it, and prints a traceback."""
+    """Log errors of TensorBoard's writing thread without a traceback: the training thread reports them."""
     before = threading.excepthook
     threading.excepthook = lambda ended: log.info("%s: %s", ended.thread and ended.thread.name, ended.exc_value)
     try:

@@ -1,9 +1,9 @@
 """Configuration of the training pairs: windows, hypotheses, augmentation, loading, validation."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from refinenet.config.checks import require, require_finite, require_fraction, require_positive
+from posecore.config import Range, check_ranges
 
 WindowKind = Literal["fixed", "diameter"]
 
@@ -18,10 +18,10 @@ class WindowConfig:
     """
 
     kind: WindowKind
-    scale: float = 1.5
+    scale: Annotated[float, Range(1, 5, unit="diameters")] = 1.5
 
     def __post_init__(self) -> None:
-        require(1.0 <= self.scale <= 5.0, f"scale is {self.scale}, expected 1 to 5 diameters")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,22 +44,16 @@ class HypothesisConfig:
     """
 
     online: bool = False
-    max_angle_deg: float = 25.0
-    max_translation_diameter: float = 0.2
-    depth_stretch: float = 1.0
-    easy_fraction: float = 0.3
-    precomputed_fraction: float = 0.0
+    max_angle_deg: Annotated[float, Range(0, 180, above=True)] = 25.0
+    max_translation_diameter: Annotated[float, Range(0, 2)] = 0.2
+    depth_stretch: Annotated[float, Range(1, 10)] = 1.0
+    easy_fraction: Annotated[float, Range(0, 1)] = 0.3
+    precomputed_fraction: Annotated[float, Range(0, 1)] = 0.0
     sample_symmetries: bool = False
     in_plane: bool = True
 
     def __post_init__(self) -> None:
-        require(0 < self.max_angle_deg <= 180, f"max_angle_deg is {self.max_angle_deg}, expected above 0 up to 180")
-        require_fraction(self, "easy_fraction", "precomputed_fraction")
-        require(
-            0 <= self.max_translation_diameter <= 2,
-            f"max_translation_diameter is {self.max_translation_diameter}, expected 0 to 2",
-        )
-        require(1 <= self.depth_stretch <= 10, f"depth_stretch is {self.depth_stretch}, expected 1 to 10")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,23 +73,19 @@ class AugmentConfig:
         min_visible_fraction: smallest fraction of the visible object that a pasted piece leaves visible.
     """
 
-    permute_channels: float = 0.0
-    gain: float = 0.0
-    scene_gain: float = 0.0
-    brightness: float = 0.0
-    contrast: float = 0.0
-    noise: float = 0.0
-    blur: float = 0.0
-    background: float = 0.0
-    occlusion: float = 0.0
-    min_visible_fraction: float = 0.35
+    permute_channels: Annotated[float, Range(0, 1)] = 0.0
+    gain: Annotated[float, Range(0, 1, under=True)] = 0.0
+    scene_gain: Annotated[float, Range(0, 1, under=True)] = 0.0
+    brightness: Annotated[float, Range(0, 1, under=True)] = 0.0
+    contrast: Annotated[float, Range(0, 1, under=True)] = 0.0
+    noise: Annotated[float, Range(0)] = 0.0
+    blur: Annotated[float, Range(0, 1)] = 0.0
+    background: Annotated[float, Range(0, 1)] = 0.0
+    occlusion: Annotated[float, Range(0, 1)] = 0.0
+    min_visible_fraction: Annotated[float, Range(0, 1)] = 0.35
 
     def __post_init__(self) -> None:
-        require_fraction(self, "permute_channels", "blur", "background", "occlusion", "min_visible_fraction")
-        for name in ("gain", "scene_gain", "brightness", "contrast"):
-            value = getattr(self, name)
-            require(0 <= value < 1, f"{name} is {value}, expected 0 to under 1")
-        require_finite(self, "noise")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,16 +101,15 @@ class LoaderConfig:
         skip_bad_shards: train on without unreadable shards, instead of stopping at the first.
     """
 
-    workers: int = 1
-    shuffle_shards: int = 4
-    prefetch: int = 4
-    cache_mb: int = 0
+    workers: Annotated[int, Range(0)] = 1
+    shuffle_shards: Annotated[int, Range(1)] = 4
+    prefetch: Annotated[int, Range(1)] = 4
+    cache_mb: Annotated[int, Range(0)] = 0
     follow: bool = False
     skip_bad_shards: bool = False
 
     def __post_init__(self) -> None:
-        require_finite(self, "workers", "cache_mb")
-        require_positive(self, "prefetch", "shuffle_shards")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -133,10 +122,9 @@ class ValidationConfig:
         every: steps between validations; the last step is always validated.
     """
 
-    scene_fraction: float = 0.1
-    pairs: int = 256
-    every: int = 500
+    scene_fraction: Annotated[float, Range(0, 1, above=True, under=True)] = 0.1
+    pairs: Annotated[int, Range(1)] = 256
+    every: Annotated[int, Range(1)] = 500
 
     def __post_init__(self) -> None:
-        require(0 < self.scene_fraction < 1, f"scene_fraction is {self.scene_fraction}, expected between 0 and 1")
-        require_positive(self, "pairs", "every")
+        check_ranges(self)

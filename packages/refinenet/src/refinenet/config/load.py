@@ -8,7 +8,7 @@ from typing import get_args
 from posecore import config as posecore_config
 
 from refinenet.config.checks import require
-from refinenet.config.renamed import require_current
+from refinenet.config.renamed import RENAMED
 from refinenet.config.train import PresetName, TrainConfig
 
 
@@ -31,8 +31,7 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
         where = str(file)
     full = [f"network.{item}" if item.startswith(("backbone.", "backbone=")) else item for item in overrides]
     mapping = posecore_config.apply_overrides(mapping, full)
-    require_current(mapping, where)
-    config = posecore_config.build(TrainConfig, mapping, where)
+    config = posecore_config.build(TrainConfig, mapping, where, renamed=RENAMED)
     require_used(config, posecore_config.assigned_keys(full))
     return config
 

@@ -1,9 +1,11 @@
 """Configuration of the network's architecture."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from refinenet.config.checks import require, require_finite, require_positive
+from posecore.config import Range, check_ranges
+
+from refinenet.config.checks import require
 
 NetworkKind = Literal["paper", "compact", "plus", "flow"]
 RotationOutput = Literal["6d", "quaternion"]
@@ -54,34 +56,29 @@ class NetworkConfig:
     """
 
     kind: NetworkKind
-    patch_px: int
+    patch_px: Annotated[int, Range(16, 1024)]
     rotation: RotationOutput | None = None
     translation: TranslationOutput | None = None
     confidence: bool = False
     backbone: BackboneConfig = field(default_factory=BackboneConfig)
-    branch_channels: int = 96
-    encoder: tuple[int, int] = (24, 48)
-    match_channels: int = 32
-    match_radius: int = 4
-    appearance_channels: int = 64
-    widths: tuple[int, int] = (96, 128)
-    hidden: int = 256
-    head_std: float = 1e-3
+    branch_channels: Annotated[int, Range(1)] = 96
+    encoder: tuple[Annotated[int, Range(1)], Annotated[int, Range(1)]] = (24, 48)
+    match_channels: Annotated[int, Range(1)] = 32
+    match_radius: Annotated[int, Range(1, 16, unit="cells")] = 4
+    appearance_channels: Annotated[int, Range(1)] = 64
+    widths: tuple[Annotated[int, Range(1)], Annotated[int, Range(1)]] = (96, 128)
+    hidden: Annotated[int, Range(1)] = 256
+    head_std: Annotated[float, Range(0)] = 1e-3
 
     def __post_init__(self) -> None:
+        check_ranges(self)
         kind, patch_px, multiple = self.kind, self.patch_px, PATCH_MULTIPLES[self.kind]
-        require(16 <= patch_px <= 1024, f"patch_px is {patch_px}, expected 16 to 1024")
         require(kind != "paper" or patch_px == 224, f"patch_px is {patch_px}, expected 224 for kind=paper")
         require(patch_px % multiple == 0, f"patch_px is {patch_px}, expected a multiple of {multiple} for kind={kind}")
         require(
             kind != "flow" or (self.rotation is None and self.translation is None),
             "rotation and translation are outputs of heads, which kind=flow does not have: leave both null",
         )
-        require(1 <= self.match_radius <= 16, f"match_radius is {self.match_radius}, expected 1 to 16 cells")
-        require_positive(self, "branch_channels", "match_channels", "appearance_channels", "hidden")
-        for name in ("encoder", "widths"):
-            require(min(getattr(self, name)) >= 1, f"{name} is {getattr(self, name)}, expected 1 or more channels")
-        require_finite(self, "head_std")
 
     @property
     def uses_depth(self) -> bool:

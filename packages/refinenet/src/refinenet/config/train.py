@@ -1,10 +1,11 @@
 """Configuration of a training run: loss, optimiser, on-policy hypotheses, and the run itself."""
 
-import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Annotated, Literal
 
-from refinenet.config.checks import require, require_finite, require_fraction, require_positive
+from posecore.config import Range, check_ranges
+
+from refinenet.config.checks import require
 from refinenet.config.data import AugmentConfig, HypothesisConfig, LoaderConfig, ValidationConfig, WindowConfig
 from refinenet.config.network import NetworkConfig
 
@@ -29,15 +30,14 @@ class OnPolicyConfig:
         updates: most updates in a row; their number is drawn for each batch.
     """
 
-    fraction: float = 0.0
-    begin: float = 0.1
-    full: float = 0.5
-    updates: int = 1
+    fraction: Annotated[float, Range(0, 1)] = 0.0
+    begin: Annotated[float, Range(0, 1)] = 0.1
+    full: Annotated[float, Range(0, 1)] = 0.5
+    updates: Annotated[int, Range(1, 8)] = 1
 
     def __post_init__(self) -> None:
-        require_fraction(self, "fraction")
-        require(0 <= self.begin <= self.full <= 1, f"begin is {self.begin}, expected 0 to full, which is {self.full}")
-        require(1 <= self.updates <= 8, f"updates is {self.updates}, expected 1 to 8")
+        check_ranges(self)
+        require(self.begin <= self.full, f"begin is {self.begin}, expected at most full, which is {self.full}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,21 +62,18 @@ class LossConfig:
     """
 
     name: LossName = "contour"
-    gamma: float = 10.0
-    point_weight: float = 1.0
-    rotation_weight: float = 1.0
-    contour_points: int = 100
-    model_points: int = 64
-    symmetry_step_deg: float = 10.0
-    confidence_weight: float = 1.0
+    gamma: Annotated[float, Range(0)] = 10.0
+    point_weight: Annotated[float, Range(0)] = 1.0
+    rotation_weight: Annotated[float, Range(0)] = 1.0
+    contour_points: Annotated[int, Range(1)] = 100
+    model_points: Annotated[int, Range(1)] = 64
+    symmetry_step_deg: Annotated[float, Range(0, 180, above=True)] = 10.0
+    confidence_weight: Annotated[float, Range(0)] = 1.0
     confidence_target: ConfidenceTarget = "visible_iou"
-    min_pose_quality: float = 0.0
+    min_pose_quality: Annotated[float, Range(0, 1, under=True)] = 0.0
 
     def __post_init__(self) -> None:
-        require(0 <= self.min_pose_quality < 1, f"min_pose_quality is {self.min_pose_quality}, expected 0 to under 1")
-        require_finite(self, "gamma", "point_weight", "rotation_weight", "confidence_weight")
-        require_positive(self, "contour_points", "model_points")
-        require(0 < self.symmetry_step_deg <= 180, f"symmetry_step_deg is {self.symmetry_step_deg}, expected up to 180")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,19 +93,16 @@ class OptimiserConfig:
     """
 
     name: Literal["adam", "adamw"] = "adam"
-    lr: float = 3e-4
-    weight_decay: float = 0.0
+    lr: Annotated[float, Range(0, above=True)] = 3e-4
+    weight_decay: Annotated[float, Range(0)] = 0.0
     schedule: Literal["constant", "cosine"] = "constant"
-    warmup_steps: int = 0
-    gradient_clip: float = 0.0
-    accumulate: int = 1
-    ema_decay: float = 0.0
+    warmup_steps: Annotated[int, Range(0)] = 0
+    gradient_clip: Annotated[float, Range(0)] = 0.0
+    accumulate: Annotated[int, Range(1)] = 1
+    ema_decay: Annotated[float, Range(0, 1, under=True)] = 0.0
 
     def __post_init__(self) -> None:
-        require(0 < self.lr < math.inf, f"lr is {self.lr}, expected a positive number")
-        require_finite(self, "weight_decay", "gradient_clip", "warmup_steps")
-        require_positive(self, "accumulate")
-        require(0 <= self.ema_decay < 1, f"ema_decay is {self.ema_decay}, expected 0 to under 1")
+        check_ranges(self)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -151,22 +145,21 @@ class TrainConfig:
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     loader: LoaderConfig = field(default_factory=LoaderConfig)
     validation: ValidationConfig = field(default_factory=ValidationConfig)
-    batch: int = 16
-    steps: int = 100_000
-    seed: int = 0
+    batch: Annotated[int, Range(1)] = 16
+    steps: Annotated[int, Range(1)] = 100_000
+    seed: Annotated[int, Range(0)] = 0
     init: str = ""
     objects: tuple[int, ...] = ()
     category: bool = False
-    threads: int = 0
+    threads: Annotated[int, Range(0)] = 0
     precision: Precision = "auto"
     device: DeviceName = "auto"
     compile: bool = False
-    log_every: int = 20
-    checkpoint_every: int = 500
+    log_every: Annotated[int, Range(1)] = 20
+    checkpoint_every: Annotated[int, Range(1)] = 500
 
     def __post_init__(self) -> None:
-        require_finite(self, "seed", "threads")
-        require_positive(self, "batch", "steps", "log_every", "checkpoint_every")
+        check_ranges(self)
         require(
             self.makes_pairs_online or not self.augment.occlusion,
             "augment.occlusion needs pairs made in the training loop: window.kind=diameter or hypothesis.online=true",

@@ -24,7 +24,6 @@ from refinenet.image import augmentation
 from refinenet.image.crops import crop_affine, hypothesis_window, optical_axis_rotation, warp
 from refinenet.image.masks import visible_fraction, visible_mask_iou
 
-Array = np.ndarray
 MIN_CONTOUR_PX = 12
 """Smallest contour from which a pose can be estimated; below, the hypothesis is drawn again, nearer."""
 
@@ -38,24 +37,24 @@ class PairArrays:
     `kept` are the input samples of the rows: a sample whose object is not visible is replaced by another.
     """
 
-    scene_rgb: UInt8[Array, "b p p 3"]
-    hypothesis_rgb: UInt8[Array, "b p p 3"]
-    T_cam_obj: Float[Array, "b 4 4"]
-    T_cam_obj_hypothesis: Float[Array, "b 4 4"]
-    K_crop: Float[Array, "b 3 3"]
-    scene_contour_m: Float[Array, "b n 3"]
-    hypothesis_contour_m: Float[Array, "b n 3"]
-    scene_distance_px: Float[Array, "b p p"]
-    hypothesis_distance_px: Float[Array, "b p p"]
-    hypothesis_depth_m: Float[Array, "b p p"] | None
-    scene_bits: UInt8[Array, "b p p"]
-    visible_iou: Float[Array, " b"] | None
-    render_colours: Float[Array, "b 3 3"]
-    obj_id: Array
-    kept: Array
+    scene_rgb: UInt8[np.ndarray, "b p p 3"]
+    hypothesis_rgb: UInt8[np.ndarray, "b p p 3"]
+    T_cam_obj: Float[np.ndarray, "b 4 4"]
+    T_cam_obj_hypothesis: Float[np.ndarray, "b 4 4"]
+    K_crop: Float[np.ndarray, "b 3 3"]
+    scene_contour_m: Float[np.ndarray, "b n 3"]
+    hypothesis_contour_m: Float[np.ndarray, "b n 3"]
+    scene_distance_px: Float[np.ndarray, "b p p"]
+    hypothesis_distance_px: Float[np.ndarray, "b p p"]
+    hypothesis_depth_m: Float[np.ndarray, "b p p"] | None
+    scene_bits: UInt8[np.ndarray, "b p p"]
+    visible_iou: Float[np.ndarray, " b"] | None
+    render_colours: Float[np.ndarray, "b 3 3"]
+    obj_id: np.ndarray
+    kept: np.ndarray
 
     @property
-    def visible_fraction(self) -> Float[Array, " b"]:
+    def visible_fraction(self) -> Float[np.ndarray, " b"]:
         """Visible fraction of each object in its patch, after augmentation."""
         return visible_fraction(self.scene_bits)
 
@@ -66,23 +65,23 @@ class _Draft:
 
     index: int
     sample: Mapping[str, Any]
-    T_cam_obj: Float[Array, "4 4"]
-    T_cam_obj_hypothesis: Float[Array, "4 4"]
-    K_crop: Float[Array, "3 3"]
-    rotation: Float[Array, "3 3"]
-    patch_from_stored: Float[Array, "2 3"]
-    scene_distance_px: Float[Array, "p p"]
-    scene_bits: UInt8[Array, "p p"]
-    valid: Bool[Array, "p p"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
+    T_cam_obj_hypothesis: Float[np.ndarray, "4 4"]
+    K_crop: Float[np.ndarray, "3 3"]
+    rotation: Float[np.ndarray, "3 3"]
+    patch_from_stored: Float[np.ndarray, "2 3"]
+    scene_distance_px: Float[np.ndarray, "p p"]
+    scene_bits: UInt8[np.ndarray, "p p"]
+    valid: Bool[np.ndarray, "p p"]
 
 
 def draw_hypothesis(
-    T_cam_obj: Float[Array, "4 4"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
     diameter_m: float,
     config: HypothesisConfig,
     rng: np.random.Generator,
     reach: float = 1,
-) -> Float[Array, "4 4"]:
+) -> Float[np.ndarray, "4 4"]:
     """A pose near the ground truth: angle and distance uniform up to their limits, axis and direction uniform.
 
     The translation along the ray from the camera to the object's origin is then scaled by `depth_stretch`.
@@ -130,7 +129,7 @@ class OnlinePairMaker:
         hypothesis: HypothesisConfig,
         augment_config: AugmentConfig,
         fixed_sides_px: Mapping[int, float] | None = None,
-        symmetries: Mapping[int, Float[Array, "s 4 4"]] | None = None,
+        symmetries: Mapping[int, Float[np.ndarray, "s 4 4"]] | None = None,
     ) -> None:
         self._meshes = meshes
         self._rasteriser = rasteriser
@@ -233,14 +232,16 @@ class OnlinePairMaker:
                 )
         return None
 
-    def _equivalent(self, T_gt: Float[Array, "4 4"], obj_id: int, rng: np.random.Generator) -> Float[Array, "4 4"]:
+    def _equivalent(
+        self, T_gt: Float[np.ndarray, "4 4"], obj_id: int, rng: np.random.Generator
+    ) -> Float[np.ndarray, "4 4"]:
         """A random symmetry-equivalent ground truth under `sample_symmetries`, else the ground truth itself."""
         transforms = self._symmetries.get(obj_id) if self._hypothesis.sample_symmetries else None
         return T_gt if transforms is None else np.asarray(T_gt @ transforms[rng.integers(len(transforms))])
 
     def _scene(
         self, draft: _Draft, samples: Sequence[Mapping[str, Any]], rng: np.random.Generator
-    ) -> tuple[UInt8[Array, "p p 3"], UInt8[Array, "p p"]]:
+    ) -> tuple[UInt8[np.ndarray, "p p 3"], UInt8[np.ndarray, "p p"]]:
         """Scene patch and its masks, with background and occluders replaced."""
         scene, bits = warp(draft.sample["scene_rgb"], draft.patch_from_stored, self._patch_px), draft.scene_bits
         exchange = rng.random() < self._augment.background
@@ -258,7 +259,7 @@ class OnlinePairMaker:
             )
         return scene, bits
 
-    def _scene_points(self, draft: _Draft) -> Float[Array, "n 3"]:
+    def _scene_points(self, draft: _Draft) -> Float[np.ndarray, "n 3"]:
         points = draft.sample["scene_contour_cam_m"]
         chosen = (np.arange(self._contour_points) * len(points)) // self._contour_points
         return np.asarray(points[chosen] @ draft.rotation.T.astype(points.dtype))

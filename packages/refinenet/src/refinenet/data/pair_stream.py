@@ -26,7 +26,6 @@ from refinenet.data.precomputed_pairs import PRECOMPUTED_FIELDS, precomputed_pai
 from refinenet.data.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
 from refinenet.image.crops import fixed_sides_px
 
-Array = np.ndarray
 ONLINE_FIELDS = (
     "scene_rgb", "scene_mask", "scene_contour_cam_m", "T_cam_obj", "T_cam_obj_hypothesis", "K", "window_px", "obj_id",
 )  # fmt: skip
@@ -46,7 +45,7 @@ class PairSource:
         self._object_index = {obj_id: i for i, obj_id in enumerate(sorted(int(k) for k in self.reader.card["objects"]))}
         self._augment = config.augment if training else AugmentConfig()
         self._cache_mb = config.loader.cache_mb if training else 0  # validation reads each shard once
-        self._cache: dict[int, dict[str, Array]] = {}
+        self._cache: dict[int, dict[str, np.ndarray]] = {}
         self._bad: dict[int, str] = {}
         self._unreported: list[str] = []
         self._rasteriser: Rasteriser | None = None
@@ -70,7 +69,7 @@ class PairSource:
         if self._rasteriser is not None:
             self._rasteriser.close()
 
-    def load(self, shards: Sequence[int]) -> dict[int, dict[str, Array]]:
+    def load(self, shards: Sequence[int]) -> dict[int, dict[str, np.ndarray]]:
         """Read whole shards, only the fields that are used.
 
         With `loader.skip_bad_shards`, unreadable shards are left out, and reported with the next batch.
@@ -83,7 +82,7 @@ class PairSource:
             fields += ("hypothesis_depth_m",)
         if set(shards) - {*self.reader.committed}:
             self.reader.refresh()
-        read: dict[int, dict[str, Array]] = {}
+        read: dict[int, dict[str, np.ndarray]] = {}
         for shard in shards:
             try:
                 read[shard] = self._cache.get(shard) or self.reader.read(shard, fields)
@@ -122,7 +121,7 @@ class PairSource:
         return batch._replace(skipped=skipped)
 
 
-def _bytes(arrays: dict[str, Array]) -> int:
+def _bytes(arrays: dict[str, np.ndarray]) -> int:
     return sum(values.nbytes for values in arrays.values())
 
 
@@ -132,10 +131,10 @@ def _validation_hypotheses(config: TrainConfig) -> HypothesisConfig:
 
 
 def _tensors(arrays: PairArrays, ids: Sequence[tuple[int, int]], object_index: dict[int, int]) -> Batch:
-    def image(rgb: Array) -> Tensor:
+    def image(rgb: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(rgb.transpose(0, 3, 1, 2)))
 
-    def real(values: Array) -> Tensor:
+    def real(values: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float32))
 
     hypothesis, K_crop = real(arrays.T_cam_obj_hypothesis), real(arrays.K_crop)
@@ -191,7 +190,7 @@ class PairStream(IterableDataset[Batch]):
                 f"expected one each; lower loader.workers, or render with a smaller shard size"
             )
 
-    def _epochs(self) -> Iterator[tuple[int, dict[int, Array]]]:
+    def _epochs(self) -> Iterator[tuple[int, dict[int, np.ndarray]]]:
         """Number and rows by shard of every epoch."""
         rows = dict(self.split.rows)
         joining = iter(()) if self.growing is None else self.growing.epochs(self.url)
@@ -246,7 +245,7 @@ class PairStream(IterableDataset[Batch]):
                     yield batch
 
     def _with_stand_ins(
-        self, source: PairSource, group: list[tuple[int, int, int]], arrays: dict[int, dict[str, Array]]
+        self, source: PairSource, group: list[tuple[int, int, int]], arrays: dict[int, dict[str, np.ndarray]]
     ) -> list[tuple[int, int, int]]:
         """The group, with samples of readable shards in place of samples of unreadable shards.
 

@@ -1,4 +1,4 @@
-"""Rotations, projection and pose updates in torch: twins of posecore.se3 and posecore.camera that carry gradients."""
+"""Rotations, projection and pose updates in torch, with gradients: counterparts of posecore.se3 and posecore.camera."""
 
 from typing import NamedTuple
 
@@ -11,15 +11,15 @@ NEAR_M = 0.01
 
 
 class Flow(NamedTuple):
-    """Where points of a hypothesis' surface are seen in the scene.
+    """Optical flow of a hypothesis' surface points, from the render to the scene.
 
     Attributes:
         p_cam_m: (b, n, 3) the points, camera frame.
         uv_px: (b, n, 2) their projections, patch pixels.
-        on_object: (b, n) which of them lie on the surface; the others mean nothing.
-        offset_px: (b, n, 2) how far from there they are seen.
-        certainty: (b, n, 3) entries (uu, uv, vv) of the upper triangular matrices that errors of `offset_px` are
-            weighted with, 1 / px: what runs along an edge is known across it alone.
+        on_object: (b, n) false for points off the surface, whose other fields are undefined.
+        offset_px: (b, n, 2) flow: position in the scene minus `uv_px`.
+        certainty: (b, n, 3) entries (uu, uv, vv) of the upper triangular matrices that weight errors of `offset_px`,
+            1 / px; full matrices, since an edge fixes the flow across its direction only.
     """
 
     p_cam_m: Float[Tensor, "b n 3"]
@@ -35,8 +35,8 @@ class PoseUpdate(NamedTuple):
     Attributes:
         dR: (b, 3, 3) rotations.
         dt: (b, 3) translations, metres.
-        confidence: (b,) logit of how well the hypothesis, before the update, fits; None from a network without it.
-        flow: What the update was worked out from, by a network that predicts that; else None.
+        confidence: (b,) logit of the confidence of the hypothesis before the update; None from a network without it.
+        flow: Flow that the update was solved from; None from a network without flow.
     """
 
     dR: Float[Tensor, "b 3 3"]
@@ -80,7 +80,7 @@ def quat_wxyz_from_rotation(R: Float[Tensor, "b 3 3"]) -> Float[Tensor, "b 4"]:
 
 
 def rotation_from_rotvec(rotvec: Float[Tensor, "b 3"]) -> Float[Tensor, "b 3 3"]:
-    """Rotations by an axis times an angle in radians; twin of `posecore.se3.rotation_from_rotvec`."""
+    """Rotations by an axis times an angle in radians; counterpart of `posecore.se3.rotation_from_rotvec`."""
     square = rotvec.square().sum(-1)[:, None, None] + 1e-12  # keeps the root's gradient at zero
     angle = torch.sqrt(square)
     x, y, z = rotvec.unbind(-1)
@@ -110,8 +110,8 @@ def positive_depth_m(z_m: Tensor, near_m: float = NEAR_M) -> Tensor:
 def project(K: Float[Tensor, "b 3 3"], p_cam_m: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:
     """Continuous pixels (pixel centre at + 0.5) of camera-frame points.
 
-    In front of the camera this is the twin of `posecore.camera.project`. Points nearer than `NEAR_M` or behind are
-    divided by `positive_depth_m`: they land far outside the patch, on the side they lie on, with a finite gradient.
+    In front of the camera this equals `posecore.camera.project`. Points nearer than `NEAR_M` or behind are
+    divided by `positive_depth_m`: they project far outside the patch, on their own side, with a finite gradient.
     """
     xy = p_cam_m[..., :2] / positive_depth_m(p_cam_m[..., 2:])
     return xy @ K[:, :2, :2].transpose(1, 2) + K[:, None, :2, 2]
@@ -135,10 +135,10 @@ def crop_update(
     K_crop: Float[Tensor, "b 3 3"],
     patch_px: int,
 ) -> PoseUpdate:
-    """Turn an update as the crop shows it into one in camera axes about the object's origin.
+    """Convert an update in crop coordinates to camera axes about the object's origin.
 
-    The rotation is given in axes turned with the ray through the crop's centre: the same picture then asks for the
-    same output wherever in the image the crop was. Translation, in units of the patch: the projection of the object's
+    The rotation is given in axes aligned with the ray through the crop's centre: the same crop then has the same
+    output wherever it lies in the image. Translation, in units of the patch: the projection of the object's
     origin moves by v_xy, and log z grows by v_z patch_px / f_crop. So scaled, one unit of v_z moves the object as far
     in metres as one unit of v_x, for any focal length; log z itself would be a tenth as large as xy and learnt late.
 

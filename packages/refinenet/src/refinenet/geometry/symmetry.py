@@ -1,4 +1,4 @@
-"""The poses that look like the truth of a symmetric object, and which of them is nearest to another pose."""
+"""Nearest symmetry-equivalent ground truth; torch counterpart of `posecore.symmetry.nearest_symmetric`."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from refinenet.geometry import poses
 
 SWEEPS = 4
-"""Over the axes of a ball, each turned about in its turn; one axis is done in one."""
+"""Coordinate-descent sweeps over the axes of a ball; a single axis needs one."""
 
 
 class ObjectPoints(NamedTuple):
@@ -17,10 +17,10 @@ class ObjectPoints(NamedTuple):
 
     Attributes:
         points_m: (o, m, 3) points of each object, object frame.
-        symmetries: (o, s, 4, 4) transforms that leave the object as it is, the identity first; continuous ones sampled.
-        valid: (o, s) which symmetries are real, not padding.
-        axes: (o, a, 3) unit axes, object frame, about which any turn leaves the object as it is; zeros are padding.
-        on_axes_m: (o, 3) a point on all of an object's axes, object frame.
+        symmetries: (o, s, 4, 4) symmetry transforms, the identity first; continuous symmetries are sampled.
+        valid: (o, s) false where symmetries are padding.
+        axes: (o, a, 3) unit axes of continuous symmetries, object frame; zeros are padding.
+        on_axes_m: (o, 3) a point on all axes of an object, object frame.
     """
 
     points_m: Float[Tensor, "o m 3"]
@@ -30,107 +30,109 @@ class ObjectPoints(NamedTuple):
     on_axes_m: Float[Tensor, "o 3"]
 
     def to(self, device: torch.device) -> "ObjectPoints":
-        """The same on another device."""
+        """Copy on another device."""
         return ObjectPoints(*(x.to(device) for x in self))
 
     @property
     def symmetric(self) -> bool:
-        """Whether any of them has more than the identity."""
+        """Whether any object has another symmetry than the identity."""
         return self.symmetries.shape[1] > 1
 
 
 @torch.no_grad()
 def nearest_by_rotation(
     T_cam_obj: Float[Tensor, "b 4 4"],
-    T_true: Float[Tensor, "b 4 4"],
+    T_gt: Float[Tensor, "b 4 4"],
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> Float[Tensor, "b 4 4"]:
-    """The truth's symmetric twin whose rotation is nearest to a pose's.
+    """The symmetry-equivalent ground truth whose rotation is nearest to a pose's.
 
-    A symmetry whose axis misses the object's origin moves that, too. The sample that is nearest by the mean L1 distance
-    of turned points is turned about the object's axes the rest of the way, to the least squared distance: so an exact
-    pose has itself as its twin, and the twin does not depend on which of them is called the truth.
+    A symmetry whose axis misses the object's origin translates the origin, too. The sample nearest by the mean L1
+    distance of rotated points is rotated about the object's axes to the least squared distance. So an exact pose is its
+    own nearest pose, whichever equivalent pose is annotated as ground truth.
 
     Args:
         T_cam_obj: Poses, metres.
-        T_true: Truths, metres.
+        T_gt: Ground-truth poses, metres.
         object_index: Rows of `objects`.
         objects: Points and symmetries.
     """
     points = objects.points_m[object_index]
-    twins = T_true[:, None] @ objects.symmetries[object_index]
-    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2)
-    distance_m = (got[:, None] - torch.einsum("bsij,bmj->bsmi", twins[..., :3, :3], points)).abs().sum(-1).mean(-1)
-    sampled = _least(twins, distance_m, objects.valid[object_index])
-    return _turned(sampled, points, got, object_index, objects)
+    equivalent = T_gt[:, None] @ objects.symmetries[object_index]
+    points_cam = points @ T_cam_obj[:, :3, :3].transpose(1, 2)
+    distance_m = (
+        (points_cam[:, None] - torch.einsum("bsij,bmj->bsmi", equivalent[..., :3, :3], points)).abs().sum(-1).mean(-1)
+    )
+    sampled = _least(equivalent, distance_m, objects.valid[object_index])
+    return _aligned(sampled, points, points_cam, object_index, objects)
 
 
 @torch.no_grad()
 def nearest_by_angle(
     T_cam_obj: Float[Tensor, "b 4 4"],
-    T_true: Float[Tensor, "b 4 4"],
+    T_gt: Float[Tensor, "b 4 4"],
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> Float[Tensor, "b 4 4"]:
-    """The same by the angle between both rotations."""
-    twins = T_true[:, None] @ objects.symmetries[object_index]
-    trace = torch.einsum("bij,bsij->bs", T_cam_obj[:, :3, :3], twins[..., :3, :3])
-    sampled = _least(twins, -trace, objects.valid[object_index])
-    unit = torch.eye(3, device=twins.device, dtype=twins.dtype).expand(len(twins), 3, 3)
-    return _turned(sampled, unit, T_cam_obj[:, :3, :3].transpose(1, 2), object_index, objects)
+    """`nearest_by_rotation` by the angle between both rotations."""
+    equivalent = T_gt[:, None] @ objects.symmetries[object_index]
+    trace = torch.einsum("bij,bsij->bs", T_cam_obj[:, :3, :3], equivalent[..., :3, :3])
+    sampled = _least(equivalent, -trace, objects.valid[object_index])
+    unit = torch.eye(3, device=equivalent.device, dtype=equivalent.dtype).expand(len(equivalent), 3, 3)
+    return _aligned(sampled, unit, T_cam_obj[:, :3, :3].transpose(1, 2), object_index, objects)
 
 
 @torch.no_grad()
 def nearest_by_points(
     T_cam_obj: Float[Tensor, "b 4 4"],
-    T_true: Float[Tensor, "b 4 4"],
+    T_gt: Float[Tensor, "b 4 4"],
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> tuple[Float[Tensor, "b 4 4"], Float[Tensor, " b"]]:
-    """The same by points in camera axes, translations included; and their mean distance, metres."""
+    """`nearest_by_rotation` by points in camera axes, translations included; and their mean distance, metres."""
     points, on_axes = objects.points_m[object_index], objects.on_axes_m[object_index][:, None]
-    twins = T_true[:, None] @ objects.symmetries[object_index]
-    got = points @ T_cam_obj[:, :3, :3].transpose(1, 2) + T_cam_obj[:, None, :3, 3]
-    true = torch.einsum("bsij,bmj->bsmi", twins[..., :3, :3], points) + twins[:, :, None, :3, 3]
-    distance_m = torch.linalg.vector_norm(got[:, None] - true, dim=-1).mean(-1)
-    sampled = _least(twins, distance_m, objects.valid[object_index])
-    # a turn about an axis leaves the points on it where they are
-    still = on_axes @ sampled[:, :3, :3].transpose(1, 2) + sampled[:, None, :3, 3]
-    twin = _turned(sampled, points - on_axes, got - still, object_index, objects)
-    true = points @ twin[:, :3, :3].transpose(1, 2) + twin[:, None, :3, 3]
-    return twin, torch.linalg.vector_norm(got - true, dim=-1).mean(-1)
+    equivalent = T_gt[:, None] @ objects.symmetries[object_index]
+    points_cam = points @ T_cam_obj[:, :3, :3].transpose(1, 2) + T_cam_obj[:, None, :3, 3]
+    true = torch.einsum("bsij,bmj->bsmi", equivalent[..., :3, :3], points) + equivalent[:, :, None, :3, 3]
+    distance_m = torch.linalg.vector_norm(points_cam[:, None] - true, dim=-1).mean(-1)
+    sampled = _least(equivalent, distance_m, objects.valid[object_index])
+    # a rotation about an axis leaves the points on the axis in place
+    fixed = on_axes @ sampled[:, :3, :3].transpose(1, 2) + sampled[:, None, :3, 3]
+    nearest = _aligned(sampled, points - on_axes, points_cam - fixed, object_index, objects)
+    true = points @ nearest[:, :3, :3].transpose(1, 2) + nearest[:, None, :3, 3]
+    return nearest, torch.linalg.vector_norm(points_cam - true, dim=-1).mean(-1)
 
 
 def _least(
-    twins: Float[Tensor, "b s 4 4"], cost: Float[Tensor, "b s"], valid: Bool[Tensor, "b s"]
+    equivalent: Float[Tensor, "b s 4 4"], cost: Float[Tensor, "b s"], valid: Bool[Tensor, "b s"]
 ) -> Float[Tensor, "b 4 4"]:
     best = cost.masked_fill(~valid, torch.inf).argmin(-1)
-    return twins[torch.arange(len(best), device=best.device), best]
+    return equivalent[torch.arange(len(best), device=best.device), best]
 
 
-def _turned(
+def _aligned(
     T_cam_obj: Float[Tensor, "b 4 4"],
     vectors: Float[Tensor, "b m 3"],
-    wanted: Float[Tensor, "b m 3"],
+    targets: Float[Tensor, "b m 3"],
     object_index: Int[Tensor, " b"],
     objects: ObjectPoints,
 ) -> Float[Tensor, "b 4 4"]:
-    """Poses turned about their objects' axes, so that vectors (object frame) come nearest to others (camera axes).
+    """Poses rotated about their objects' axes, aligning vectors (object frame) with targets (camera axes).
 
-    In closed form: of a turn about one axis, the sum of squared distances is a sine of its angle.
+    In closed form: the sum of squared distances is a sine of the angle about an axis.
     """
     axes, on_axes = objects.axes[object_index], objects.on_axes_m[object_index]
     for _ in range(SWEEPS if axes.shape[1] > 1 else 1):
         for axis in axes.unbind(1):
-            here = wanted @ T_cam_obj[:, :3, :3]
+            here = targets @ T_cam_obj[:, :3, :3]
             across = vectors - (vectors * axis[:, None]).sum(-1, keepdim=True) * axis[:, None]
             ahead = torch.linalg.cross(axis[:, None].expand_as(vectors), vectors)
             angle = torch.atan2((here * ahead).sum((1, 2)), (here * across).sum((1, 2)))
             R = poses.rotation_from_rotvec(angle[:, None] * axis)  # the identity where there is no axis
             R_new = T_cam_obj[:, :3, :3] @ R
-            moved = (T_cam_obj[:, :3, :3] - R_new) @ on_axes[..., None]
+            shift_m = (T_cam_obj[:, :3, :3] - R_new) @ on_axes[..., None]
             T_cam_obj = T_cam_obj.clone()
-            T_cam_obj[:, :3, 3] += moved[..., 0]
+            T_cam_obj[:, :3, 3] += shift_m[..., 0]
             T_cam_obj[:, :3, :3] = R_new
     return T_cam_obj

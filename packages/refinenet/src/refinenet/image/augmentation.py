@@ -1,4 +1,4 @@
-"""Colours, backgrounds and occluders exchanged at training time, on uint8 patches."""
+"""Augmentation of colours, backgrounds and occluders, on uint8 patches."""
 
 import cv2
 import numpy as np
@@ -8,16 +8,14 @@ from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE
 from refinenet.config import AugmentConfig
 from refinenet.image.crops import warp
 
-Array = np.ndarray
-
 
 def colour(
-    scene_rgb: UInt8[Array, "b p p 3"],
-    hypothesis_rgb: UInt8[Array, "b p p 3"],
+    scene_rgb: UInt8[np.ndarray, "b p p 3"],
+    hypothesis_rgb: UInt8[np.ndarray, "b p p 3"],
     config: AugmentConfig,
     rng: np.random.Generator,
-) -> tuple[UInt8[Array, "b p p 3"], UInt8[Array, "b p p 3"], Float[Array, "b 3 3"]]:
-    """Change colours: what a different object colour would do to both patches, what a camera would do to the scene's.
+) -> tuple[UInt8[np.ndarray, "b p p 3"], UInt8[np.ndarray, "b p p 3"], Float[np.ndarray, "b 3 3"]]:
+    """Augment colours: of the object in both patches alike, of camera and light in the scene alone.
 
     Args:
         scene_rgb: Scene patches.
@@ -26,7 +24,7 @@ def colour(
         rng: Source of every draw.
 
     Returns:
-        New scene and hypothesis patches, and the matrices that took the renders' colours to their new ones.
+        New scene and hypothesis patches, and the colour matrices applied to the renders.
     """
     b = len(scene_rgb)
     geometric = AugmentConfig(
@@ -34,15 +32,15 @@ def colour(
     )
     if config == geometric:
         return scene_rgb, hypothesis_rgb, np.tile(np.eye(3, dtype=np.float32), (b, 1, 1))
-    of_render = np.tile(np.eye(3, dtype=np.float32), (b, 1, 1))
+    render_colours = np.tile(np.eye(3, dtype=np.float32), (b, 1, 1))
     scene, hypothesis = scene_rgb.astype(np.float32), hypothesis_rgb.astype(np.float32)
     for i in np.flatnonzero(rng.random(b) < config.permute_channels):
         order = rng.permutation(3)
         scene[i], hypothesis[i] = scene[i][..., order], hypothesis[i][..., order]
-        of_render[i] = of_render[i][order]
+        render_colours[i] = render_colours[i][order]
     both = _spread(rng, b, config.gain)
     hypothesis *= both
-    of_render *= both[:, 0, 0, :, None]
+    render_colours *= both[:, 0, 0, :, None]
     scene *= both * _spread(rng, b, config.scene_gain)
     contrast = _spread(rng, b, config.contrast, channels=1)
     shift = 255.0 * (_spread(rng, b, config.brightness, channels=1) - 1.0)
@@ -53,30 +51,30 @@ def colour(
     if config.noise > 0:
         sigma = (config.noise * rng.random(b)).astype(np.float32)[:, None, None, None]
         scene += rng.standard_normal(scene.shape, dtype=np.float32) * sigma
-    return _to_uint8(scene), _to_uint8(hypothesis), of_render
+    return _to_uint8(scene), _to_uint8(hypothesis), render_colours
 
 
-def _spread(rng: np.random.Generator, b: int, width: float, channels: int = 3) -> Float[Array, "b 1 1 c"]:
+def _spread(rng: np.random.Generator, b: int, width: float, channels: int = 3) -> Float[np.ndarray, "b 1 1 c"]:
     return rng.uniform(1 - width, 1 + width, (b, 1, 1, channels)).astype(np.float32)
 
 
-def _to_uint8(values: Float[Array, "b p p 3"]) -> UInt8[Array, "b p p 3"]:
+def _to_uint8(values: Float[np.ndarray, "b p p 3"]) -> UInt8[np.ndarray, "b p p 3"]:
     return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
 def background_patch(
-    source_rgb: UInt8[Array, "q q 3"] | None,
-    foreground: Bool[Array, "q q"] | None,
+    source_rgb: UInt8[np.ndarray, "q q 3"] | None,
+    foreground: Bool[np.ndarray, "q q"] | None,
     patch_px: int,
     rng: np.random.Generator,
-) -> UInt8[Array, "p p 3"]:
-    """A background for a patch: an enlarged piece of another scene with little foreground in it, or smooth noise.
+) -> UInt8[np.ndarray, "p p 3"]:
+    """A background for a patch: an enlarged piece of another scene with little foreground, or smooth noise.
 
     Args:
-        source_rgb: Another scene's patch; None asks for noise.
-        foreground: Where that scene shows objects, the target among them: a second target would mislead.
+        source_rgb: Another scene's patch; None gives noise.
+        foreground: Foreground of that scene, the target included: a second target would mislead.
         patch_px: Side of the result.
-        rng: Chooses piece, turn and mirroring.
+        rng: Source of piece, rotation and mirroring.
     """
     if source_rgb is None or foreground is None or rng.random() < 0.2:
         coarse = rng.integers(0, 256, (int(rng.integers(2, 9)),) * 2 + (3,), dtype=np.uint8)
@@ -86,9 +84,9 @@ def background_patch(
     for _ in range(4):
         side = int(size * rng.uniform(0.25, 0.6))
         row, column = rng.integers(0, size - side + 1, 2)
-        share = float(foreground[row : row + side : 2, column : column + side : 2].mean())
-        if share < best:
-            best, piece = share, source_rgb[row : row + side, column : column + side]
+        fraction = float(foreground[row : row + side : 2, column : column + side : 2].mean())
+        if fraction < best:
+            best, piece = fraction, source_rgb[row : row + side, column : column + side]
     piece = np.rot90(piece, int(rng.integers(4)))
     if rng.random() < 0.5:
         piece = piece[:, ::-1]
@@ -96,28 +94,28 @@ def background_patch(
 
 
 def occlude(
-    scene_rgb: UInt8[Array, "p p 3"],
-    scene_bits: UInt8[Array, "p p"],
-    source_rgb: UInt8[Array, "q q 3"],
-    source_bits: UInt8[Array, "q q"],
-    leaves: float,
+    scene_rgb: UInt8[np.ndarray, "p p 3"],
+    scene_bits: UInt8[np.ndarray, "p p"],
+    source_rgb: UInt8[np.ndarray, "q q 3"],
+    source_bits: UInt8[np.ndarray, "q q"],
+    min_visible_fraction: float,
     rng: np.random.Generator,
-) -> tuple[UInt8[Array, "p p 3"], UInt8[Array, "p p"]]:
+) -> tuple[UInt8[np.ndarray, "p p 3"], UInt8[np.ndarray, "p p"]]:
     """Paste a piece of another scene's foreground over the visible object.
 
-    The piece is an ellipse of it, turned and scaled: a whole one would be a second target where it shows the same
-    object. Other objects are preferred to the target's. A piece that hides too much is tried again at half its size.
+    The piece is an elliptic part of the foreground, rotated and scaled: a whole silhouette of the same object would be
+    a second target. Other objects are preferred to the target's. A piece that covers too much is halved in size.
 
     Args:
         scene_rgb: Patch.
-        scene_bits: Its masks, bits as in shards' `scene_mask`.
+        scene_bits: Mask bits of the patch, as in shards' `scene_mask`.
         source_rgb: Another scene's patch.
-        source_bits: Its masks.
-        leaves: Share of the visible object that stays visible.
-        rng: Chooses piece, place, turn and size.
+        source_bits: Mask bits of that patch.
+        min_visible_fraction: Smallest fraction of the visible object that stays visible.
+        rng: Source of piece, position, rotation and size.
 
     Returns:
-        New patch and masks; as they were where either scene shows nothing to paste or to paste over.
+        New patch and mask bits; unchanged where there is nothing to paste or to cover.
     """
     visible = np.argwhere((scene_bits & BIT_VISIBLE) > 0)
     foreground = (source_bits & BIT_FOREGROUND) > 0
@@ -140,11 +138,11 @@ def occlude(
         linear = np.array([[c, -s], [s, c]])
         shift = goal[::-1] + 0.5 - linear @ (column + 0.5, row + 0.5)
         affine = np.concatenate([linear, shift[:, None]], axis=1)
-        over = warp(piece, affine, len(scene_rgb), nearest=True) > 0
-        hidden = (scene_bits[over] & BIT_VISIBLE) > 0
-        if hidden.sum() <= (1 - leaves) * len(visible):
-            rgb = np.where(over[..., None], warp(source_rgb, affine, len(scene_rgb)), scene_rgb)
+        covering = warp(piece, affine, len(scene_rgb), nearest=True) > 0
+        hidden = (scene_bits[covering] & BIT_VISIBLE) > 0
+        if hidden.sum() <= (1 - min_visible_fraction) * len(visible):
+            rgb = np.where(covering[..., None], warp(source_rgb, affine, len(scene_rgb)), scene_rgb)
             covered = (scene_bits & np.uint8(0xFF ^ BIT_VISIBLE)) | np.uint8(BIT_FOREGROUND)
-            return rgb, np.where(over, covered, scene_bits)
+            return rgb, np.where(covering, covered, scene_bits)
         scale *= 0.5
     return scene_rgb, scene_bits

@@ -1,8 +1,8 @@
 """Checkpoints: weights with the resolved config, step, seed, versions and dataset hash in one safetensors file.
 
-The weights are the ones to refine with: the running average, where the run keeps one. The optimiser's state, and the
-weights that training goes on with, lie beside it in a file named by its step, written first: a run killed between the
-two still finds the pair that belongs together.
+The weights are those to refine with: the EMA, where the run has one. The optimiser's state, and the weights that
+training continues with, are in a file beside it named by its step and written first: a run killed between the two still
+finds a matching pair.
 """
 
 import io
@@ -29,12 +29,12 @@ from refinenet.models.networks import make_network
 
 FORMAT, VERSION = "refinenet", "1"
 STATE = ("optimiser", "best_mm", "world")
-"""What every optimiser state holds."""
+"""Keys of every optimiser state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where weights come from.
+    """Origin of weights.
 
     Attributes:
         config: Resolved config of the run.
@@ -51,7 +51,7 @@ class Provenance:
     camera_fx_px: float = 0.0
 
     def window_side_px(self, obj_id: int) -> float:
-        """Side of an object's fixed window in training, pixels; of an unseen member of a category the largest."""
+        """Side of an object's fixed window in training, pixels; the largest for an unseen member of a category."""
         cards = [self.objects[str(obj_id)]] if str(obj_id) in self.objects else list(self.objects.values())
         return max(float(card["window_side_px"]) for card in cards)
 
@@ -61,7 +61,7 @@ class Checkpoint:
     """A checkpoint file in memory.
 
     Attributes:
-        provenance: Where it comes from.
+        provenance: Origin of the weights.
         tensors: Weights by name.
         path: File.
         sha256: Hash of the file.
@@ -76,11 +76,11 @@ class Checkpoint:
         """Load these weights into another run's network.
 
         Args:
-            network: Gets them.
-            config: Its own.
+            network: Receives the weights.
+            config: Configuration of that network.
 
         Raises:
-            CheckpointError: It has other layers, or its outputs mean something else.
+            CheckpointError: The network has other layers, or outputs of another kind.
         """
         try:
             network.load_state_dict(self.tensors)
@@ -90,11 +90,11 @@ class Checkpoint:
                 f"{self.path}: weights of another network ({detail}); begin with a checkpoint of preset "
                 f"{self.provenance.config.preset} trained with the same `network` settings as this run"
             ) from error
-        mine, wanted = forms(self.provenance.config.network), forms(config)
-        if mine != wanted:  # heads of both kinds of translation have the same shape
+        stored, expected = forms(self.provenance.config.network), forms(config)
+        if stored != expected:  # heads of both kinds of translation have the same shape
             raise CheckpointError(
-                f"{self.path}: its outputs are {' and '.join(mine)}, this run's are {' and '.join(wanted)}; train with "
-                f"--set network.rotation={mine[0]} --set network.translation={mine[1]}"
+                f"{self.path}: its outputs are {' and '.join(stored)}, this run's are {' and '.join(expected)}; train "
+                f"with --set network.rotation={stored[0]} --set network.translation={stored[1]}"
             )
 
     def network(self) -> nn.Module:
@@ -134,7 +134,7 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
 
     Args:
         path: File.
-        preset: If given, the preset it must be of.
+        preset: Required preset; None accepts any.
 
     Raises:
         CheckpointError: Missing, not a checkpoint of this project, of another version, or of another preset.
@@ -148,9 +148,9 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
         raise CheckpointError(f"{path}: no such checkpoint; train one with `refinenet train`") from error
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: no readable safetensors file ({error}); choose another checkpoint") from error
-    found = (metadata.get("format"), metadata.get("version"))
-    if found != (FORMAT, VERSION):
-        raise CheckpointError(f"{path}: format {found[0]} version {found[1]}, expected {FORMAT} version {VERSION}")
+    header = (metadata.get("format"), metadata.get("version"))
+    if header != (FORMAT, VERSION):
+        raise CheckpointError(f"{path}: format {header[0]} version {header[1]}, expected {FORMAT} version {VERSION}")
     try:
         config = posecore_config.build(TrainConfig, migrated_config(json.loads(metadata["config"])), str(path))
         provenance = Provenance(
@@ -198,7 +198,7 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
 
 
 def drop_leftovers(folder: Path, keep: int) -> None:
-    """Remove the optimiser states of other steps, and what a killed run left under temporary names."""
+    """Remove the optimiser states of other steps, and temporary files of a killed run."""
     for path in folder.glob("optimiser-*.pt"):
         if path != _state_path(folder, keep):
             path.unlink(missing_ok=True)
@@ -216,19 +216,19 @@ MAY_CHANGE = (
     "loader.skip_bad_shards", "loader.prefetch", "loader.cache_mb", "init", "network.backbone.weights",
     "network.backbone.pretrained",
 )  # fmt: skip
-"""Settings that a resumed run may change: they decide how long and where it runs, or how it began.
+"""Settings that a resumed run may change: duration, machine, and initial weights.
 
-The share of scenes held out is none of them: with another one, scenes that were trained on would be measured on.
+Not `validation.scene_fraction`: with another value, training scenes would become validation scenes.
 """
 
 
-def require_same(stored: TrainConfig, wanted: TrainConfig, where: Path) -> None:
+def require_same(stored: TrainConfig, requested: TrainConfig, where: Path) -> None:
     """Refuse to resume a run under settings that would make it another run.
 
     Raises:
         ConfigError: A setting differs; the first is named with both values.
     """
-    before, now = (dict(_leaves(posecore_config.to_dict(config))) for config in (stored, wanted))
+    before, now = (dict(_leaves(posecore_config.to_dict(config))) for config in (stored, requested))
     for key in before:
         if key not in MAY_CHANGE and before[key] != now[key]:
             raise ConfigError(f"{where}: {key} was {before[key]} and is now {now[key]}; resume with the same settings")

@@ -1,4 +1,4 @@
-"""What networks match two patches with: learned features, or gradient orientations, which need no learning."""
+"""Correlation (cost volume) of two patches: of learned features, or of gradient orientations without learning."""
 
 import torch
 from jaxtyping import Float, UInt8
@@ -8,16 +8,16 @@ from torch.nn.functional import avg_pool2d, pad
 from refinenet.image.edge_gradients import OUTLINE
 
 HALF_STRENGTH = {"render": 24.0, "scene": 12.0}
-"""Gradients, in grey levels over two pixels, that count half: the image's edges are softened by lens and resampling."""
-LEAST_AMOUNT = 0.02
-"""Share of a window that is edges, under which agreement fades."""
+"""Gradients of weight one half, in grey levels over two pixels: lens and resampling soften the image's edges."""
+MIN_EDGE_FRACTION = 0.02
+"""Fraction of edges in a window below which the similarity fades."""
 
 
 class LocalCorrelation(nn.Module):
-    """How well each hypothesis cell matches the scene cells around it: (b, c, n, n) twice to (b, k*k, n/2, n/2).
+    """Correlation of each hypothesis cell with the scene cells around it: (b, c, n, n) twice to (b, k*k, n/2, n/2).
 
     Dot products of features over `sqrt(c)`, for every second hypothesis cell in both directions, with the scene cells
-    up to `radius` away; scene cells outside the patch match with 0.
+    up to `radius` away; scene cells outside the patch give 0.
 
     Source: the correlation layer of FlowNet (Dosovitskiy et al., ICCV 2015).
     """
@@ -28,31 +28,31 @@ class LocalCorrelation(nn.Module):
         row, column = torch.meshgrid(torch.arange(0, cells, 2), torch.arange(0, cells, 2), indexing="ij")
         down, right = torch.meshgrid(torch.arange(self.side), torch.arange(self.side), indexing="ij")
         padded = cells + 2 * radius
-        where = (row.flatten()[:, None] + down.flatten()) * padded + column.flatten()[:, None] + right.flatten()
-        self.register_buffer("where", where[None], persistent=False)
-        self.where: Tensor
+        cells_around = (row.flatten()[:, None] + down.flatten()) * padded + column.flatten()[:, None] + right.flatten()
+        self.register_buffer("cells_around", cells_around[None], persistent=False)
+        self.cells_around: Tensor
 
     def forward(
         self, hypothesis: Float[Tensor, "b c n n"], scene: Float[Tensor, "b c n n"]
     ) -> Float[Tensor, "b k m m"]:
-        """Match features of both patches."""
+        """Correlation of both patches' features."""
         b, c, n, _ = hypothesis.shape
         r = self.radius
         queries = hypothesis[:, :, ::2, ::2].permute(0, 2, 3, 1).reshape(b, -1, c)
         keys = pad(scene, (r, r, r, r)).permute(0, 2, 3, 1).reshape(b, -1, c)
         all_pairs = torch.bmm(queries, keys.transpose(1, 2)) * c**-0.5
-        near = all_pairs.gather(2, self.where.expand(b, -1, -1))
+        near = all_pairs.gather(2, self.cells_around.expand(b, -1, -1))
         return near.reshape(b, n // 2, n // 2, -1).permute(0, 3, 1, 2)
 
 
 class GradientCorrelation(nn.Module):
-    """How well gradients of the render agree with the scene's around each cell of four pixels, for every small shift.
+    """Similarity of the render's and the scene's gradients around each cell of four pixels, for every small shift.
 
-    Colours and light of a render are not those of the image, but edges lie in the same places. So what is matched is
-    given, not learned: in windows of twelve pixels, by shifts of two pixels up to `radius`, (a) orientations of the
-    strongest change of any channel, silhouette included, without their sign, and (b) directions of the change of
-    lightness inside the silhouette, with it. Agreement is a share of the edges that the render has there; how many
-    these are comes last.
+    Colours and light of a render differ from the image's, but edges have the same positions. So the features are fixed,
+    not learned: in windows of twelve pixels, by shifts of two pixels up to `radius`, (a) orientations of the strongest
+    gradient of any channel, silhouette included, without sign, and (b) directions of the lightness gradient inside the
+    silhouette, with sign. The similarity is relative to the amount of edges in the render's window, which makes the
+    last two channels.
 
     Attributes:
         channels: `2 * (2 * radius + 1)**2 + 2`.
@@ -72,35 +72,40 @@ class GradientCorrelation(nn.Module):
         mask: Float[Tensor, "b p p"],
         scene_rgb: UInt8[Tensor, "b 3 p p"],
     ) -> Float[Tensor, "b k m m"]:
-        """Match both patches; inputs get no gradient."""
+        """Similarity of both patches; inputs get no gradient."""
         values, scene = hypothesis_rgb.float(), scene_rgb.float()
         outlined = torch.cat((values, OUTLINE * mask[:, None]), 1)
         inside = avg_pool2d(mask[:, None], 2) > 0.99
-        mine = torch.cat(
+        render = torch.cat(
             (orientations(outlined, HALF_STRENGTH["render"]), directions(values, HALF_STRENGTH["render"]) * inside), 1
         )
-        theirs = torch.cat(
+        image = torch.cat(
             (orientations(scene, HALF_STRENGTH["scene"]), directions(scene, HALF_STRENGTH["scene"])), 1
         )  # fmt: skip
-        amounts = torch.stack([torch.linalg.vector_norm(mine[:, i : i + 2], dim=1) for i in (0, 2)], 1)
+        amounts = torch.stack([torch.linalg.vector_norm(render[:, i : i + 2], dim=1) for i in (0, 2)], 1)
         amounts = _around(avg_pool2d(amounts, 2))
-        agreement = _around(self._agreement(mine, theirs))
-        shares = agreement.unflatten(1, (2, -1)) / (amounts[:, :, None] + LEAST_AMOUNT)
-        return torch.cat((shares.flatten(1, 2), amounts), 1)
+        similarity = _around(self._similarity(render, image)).unflatten(1, (2, -1))
+        relative = similarity / (amounts[:, :, None] + MIN_EDGE_FRACTION)
+        return torch.cat((relative.flatten(1, 2), amounts), 1)
 
-    def _agreement(self, mine: Float[Tensor, "b 4 n n"], theirs: Float[Tensor, "b 4 n n"]) -> Float[Tensor, "b k m m"]:
-        """Products for every shift, orientations first, as means of two by two; 0 from beyond the border."""
-        n, r = mine.shape[-1], self.radius
-        # The batch comes last, where all of it is read at once: half the time of any other layout.
-        mine, theirs = mine.permute(1, 2, 3, 0).contiguous(), pad(theirs, (r, r, r, r)).permute(1, 2, 3, 0).contiguous()
-        found = []
+    def _similarity(
+        self, render: Float[Tensor, "b 4 n n"], image: Float[Tensor, "b 4 n n"]
+    ) -> Float[Tensor, "b k m m"]:
+        """Products for every shift, orientations first, as means of two by two cells; 0 beyond the border."""
+        n, r = render.shape[-1], self.radius
+        # The batch is the last, contiguous axis: half the time of any other layout.
+        render, image = (
+            render.permute(1, 2, 3, 0).contiguous(),
+            pad(image, (r, r, r, r)).permute(1, 2, 3, 0).contiguous(),
+        )
+        products = []
         for down in range(self.side):
             # all shifts to the right at once, as a view
-            product = theirs[:, down : down + n].unfold(2, n, 1).permute(0, 1, 2, 4, 3) * mine[:, :, None]
+            product = image[:, down : down + n].unfold(2, n, 1).permute(0, 1, 2, 4, 3) * render[:, :, None]
             product = product[0::2] + product[1::2]
             product = product[:, 0::2] + product[:, 1::2]
-            found.append(product[:, :, :, 0::2] + product[:, :, :, 1::2])
-        return torch.stack(found, 1).permute(5, 0, 1, 3, 2, 4).flatten(1, 3) / 4
+            products.append(product[:, :, :, 0::2] + product[:, :, :, 1::2])
+        return torch.stack(products, 1).permute(5, 0, 1, 3, 2, 4).flatten(1, 3) / 4
 
 
 def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
@@ -110,8 +115,8 @@ def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
     return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9
 
 
-def gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"], Float[Tensor, "b c p p"]]:
-    """Change over two pixels to the right and down; counterpart of the first half of `orientation_gradients`."""
+def feature_gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"], Float[Tensor, "b c p p"]]:
+    """Change over two pixels to the right and down, smoothed across as in `image.edge_gradients`."""
     padded = pad(values, (1, 1, 1, 1), mode="replicate")
     across, down = padded[..., 2:] - padded[..., :-2], padded[..., 2:, :] - padded[..., :-2, :]
     dx = (across[..., :-2, :] + 2 * across[..., 1:-1, :] + across[..., 2:, :]) / 4
@@ -120,14 +125,14 @@ def gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"
 
 
 def orientations(values: Float[Tensor, "b c p p"], half_strength: float) -> Float[Tensor, "b 2 n n"]:
-    """Cosine and sine of twice the gradient's angle, of the channel that changes most, times a strength under 1.
+    """Cosine and sine of twice the angle of the strongest channel's gradient, times a strength under 1.
 
-    Of cells of two pixels: means.
+    Means over cells of two pixels.
     """
-    dx, dy = gradients(values)
+    dx, dy = feature_gradients(values)
     x, y = dx[:, :1], dy[:, :1]
     square = x.square() + y.square()
-    for i in range(1, values.shape[1]):  # argmax over channels that lie apart in memory takes several times as long
+    for i in range(1, values.shape[1]):  # argmax over channels strided in memory takes several times as long
         other_x, other_y = dx[:, i : i + 1], dy[:, i : i + 1]
         other = other_x.square() + other_y.square()
         more = other > square
@@ -137,7 +142,7 @@ def orientations(values: Float[Tensor, "b c p p"], half_strength: float) -> Floa
 
 
 def directions(values: Float[Tensor, "b 3 p p"], half_strength: float) -> Float[Tensor, "b 2 n n"]:
-    """Cosine and sine of the angle of lightness' gradient, times a strength under 1; of cells of two pixels: means."""
-    dx, dy = gradients(values.mean(1, keepdim=True))
+    """Cosine and sine of the lightness gradient's angle, times a strength under 1; means over cells of two pixels."""
+    dx, dy = feature_gradients(values.mean(1, keepdim=True))
     weight = torch.rsqrt(dx.square() + dy.square() + half_strength**2)
     return avg_pool2d(torch.cat((dx * weight, dy * weight), 1), 2)

@@ -22,7 +22,7 @@ from refinenet.config import NetworkConfig
 from refinenet.models.checkpoint import Checkpoint
 
 INPUTS = ("scene_rgb", "hypothesis_rgb", "T_cam_obj", "K_crop", "hypothesis_depth_m")
-"""The last for networks that see depth only."""
+"""The last for networks with depth input only."""
 OUTPUTS = ("dR", "dt_m", "confidence_logit")
 TOLERANCES = {"dR": 1e-4, "dt_m": 1e-5, "confidence_logit": 1e-3}
 """Largest difference from the network in any entry: of a rotation, in metres, of a logit."""
@@ -33,7 +33,7 @@ Outputs = dict[str, np.ndarray]
 
 
 class FlatNetwork(nn.Module):
-    """A network with tensors in and tensors out: `INPUTS` to `OUTPUTS`, without those that it does not have."""
+    """A network with plain tensors as inputs and outputs: `INPUTS` to `OUTPUTS`, as far as it has them."""
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
@@ -51,7 +51,7 @@ class FlatNetwork(nn.Module):
 def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
     """Write a network as ONNX (`.onnx`) or as a torch.export program (`.pt2`), of any batch size, and check the file.
 
-    The file carries what its user must know as metadata `refinenet` (JSON): patch, window, objects, checkpoint hash.
+    The file has metadata `refinenet` (JSON) for its user: patch, window, objects, checkpoint hash.
 
     Args:
         loaded: Checkpoint.
@@ -61,7 +61,7 @@ def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
         Largest difference of each output from the network's, over batches of 1 and 5 random pairs.
 
     Raises:
-        ConfigError: The ending is another one, or a package that is needed is missing.
+        ConfigError: Another file name extension, or a missing package.
         CheckpointError: The exported network differs by more than `TOLERANCES`.
     """
     if out.suffix not in (".onnx", ".pt2"):
@@ -110,9 +110,9 @@ def _differences(network: FlatNetwork, run: Callable[..., Outputs], config: Netw
         inputs = random_pairs(b, config.patch_px, seed=b, depth=config.uses_depth)
         with torch.no_grad():
             expected = network(*inputs)
-        found = run(*inputs)
+        outputs = run(*inputs)
         for name, tensor in zip(OUTPUTS, expected, strict=False):
-            difference = float(np.abs(found[name] - tensor.numpy()).max())
+            difference = float(np.abs(outputs[name] - tensor.numpy()).max())
             worst[name] = max(worst.get(name, 0.0), difference) if difference == difference else float("nan")
     return worst
 
@@ -161,8 +161,8 @@ def _program_runner(content: bytes) -> Callable[..., Outputs]:
 
     def run(*inputs: Tensor) -> Outputs:
         with torch.no_grad():
-            found = module(*inputs)
-        return {name: tensor.numpy() for name, tensor in zip(OUTPUTS, found, strict=False)}
+            outputs = module(*inputs)
+        return {name: tensor.numpy() for name, tensor in zip(OUTPUTS, outputs, strict=False)}
 
     return run
 
@@ -188,7 +188,7 @@ def _require(*packages: str) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep the exporters' warnings about themselves off the terminal."""
+    """Suppress the exporters' internal warnings."""
     logger = logging.getLogger("torch.onnx")
     before = logger.level
     logger.setLevel(logging.ERROR)

@@ -1,4 +1,4 @@
-"""Poses from flow: the update that brings a hypothesis' surface points to where they are seen in the scene."""
+"""Pose update from flow: weighted least squares on a hypothesis' surface points."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -8,11 +8,11 @@ from refinenet.geometry import poses
 from refinenet.geometry.poses import Flow, PoseUpdate
 
 CELL_PX = 4
-"""Side of the cells that are looked for, one surface point in each."""
+"""Side of a flow cell; each has one surface point."""
 STEPS = 3
-"""Gauss-Newton steps; they converge where the flow is that of a rigid move."""
+"""Gauss-Newton steps, enough to converge for the flow of a rigid motion."""
 DAMPING = 1e-4
-"""Share of the mean diagonal that is added to it: a turn that nobody sees gets no step."""
+"""Fraction of the mean diagonal added to the diagonal: an unobservable rotation gets no step."""
 
 
 def surface_points(
@@ -35,15 +35,15 @@ def offsets_to_px(
     flow: Flow, T_cam_obj_hypothesis: Float[Tensor, "b 4 4"], T_cam_obj: Float[Tensor, "b 4 4"],
     K_crop: Float[Tensor, "b 3 3"],
 ) -> Float[Tensor, "b n 2"]:  # fmt: skip
-    """The offsets that a flow's points have in the scene if a pose is the true one."""
+    """Offsets of a flow's points in the scene for a pose."""
     update = poses.update_between(T_cam_obj_hypothesis, T_cam_obj)
     t = T_cam_obj_hypothesis[:, None, :3, 3]
-    moved_m = (flow.p_cam_m - t) @ update.dR.transpose(1, 2) + t + update.dt[:, None]
-    return poses.project(K_crop, moved_m) - flow.uv_px
+    updated_m = (flow.p_cam_m - t) @ update.dR.transpose(1, 2) + t + update.dt[:, None]
+    return poses.project(K_crop, updated_m) - flow.uv_px
 
 
 def weighted(error_px: Float[Tensor, "b n 2"], certainty: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:
-    """Errors in standard deviations, about."""
+    """Errors times the square root of their information, about in standard deviations."""
     u, v = error_px.unbind(-1)
     return torch.stack((certainty[..., 0] * u + certainty[..., 1] * v, certainty[..., 2] * v), -1)
 
@@ -54,10 +54,10 @@ def update_from_flow(
     """The update whose projected points fit a flow best: Gauss-Newton on weighted errors, robust; differentiable.
 
     Args:
-        flow: What is seen.
+        flow: Flow of the hypothesis' surface.
         T_cam_obj: The hypothesis.
         K_crop: Intrinsics of the patch.
-        length_m: Unit of translation; with about the object's radius one damping suits turns and moves.
+        length_m: Unit of translation; at about the object's radius, one damping suits rotation and translation.
     """
     origin_m = T_cam_obj[:, :3, 3]
     arm_m = flow.p_cam_m - origin_m[:, None]
@@ -67,19 +67,21 @@ def update_from_flow(
         torch.zeros_like(origin_m),
     )
     for _ in range(STEPS):
-        turned_m = arm_m @ dR.transpose(1, 2)
-        p_cam_m = turned_m + (origin_m + dt)[:, None]
+        rotated_m = arm_m @ dR.transpose(1, 2)
+        p_cam_m = rotated_m + (origin_m + dt)[:, None]
         z_m = poses.positive_depth_m(p_cam_m[..., 2:])
         error = weighted(poses.project(K_crop, p_cam_m) - flow.uv_px - flow.offset_px, flow.certainty)
         per_z, zero = focal / z_m, torch.zeros_like(z_m)
         ray = p_cam_m[..., :2] / z_m
         by_u = torch.cat((per_z[..., :1], zero, -per_z[..., :1] * ray[..., :1]), -1)
         by_v = torch.cat((zero, per_z[..., 1:], -per_z[..., 1:] * ray[..., 1:]), -1)
-        sure = flow.certainty[..., None]
-        by_point = torch.stack((sure[..., 0, :] * by_u + sure[..., 1, :] * by_v, sure[..., 2, :] * by_v), -2)
-        by_turn = torch.linalg.cross(turned_m[..., None, :].expand_as(by_point), by_point)
-        J = torch.cat((by_turn, by_point * length_m[:, None, None, None]), -1).flatten(1, 2)
-        # of the likelihood's length |W e|, rounded off at 1
+        certainty = flow.certainty[..., None]
+        by_point = torch.stack(
+            (certainty[..., 0, :] * by_u + certainty[..., 1, :] * by_v, certainty[..., 2, :] * by_v), -2
+        )
+        by_rotation = torch.linalg.cross(rotated_m[..., None, :].expand_as(by_point), by_point)
+        J = torch.cat((by_rotation, by_point * length_m[:, None, None, None]), -1).flatten(1, 2)
+        # weights of the Laplace likelihood's |W e|, smoothed at 1
         robust = flow.on_object / torch.sqrt(error.detach().square().sum(-1) + 1.0)
         weighted_J = J * robust[..., None].expand(-1, -1, 2).flatten(1)[..., None]
         step = -_solved(weighted_J.transpose(1, 2) @ J, (weighted_J * error.flatten(1)[..., None]).sum(1))
@@ -89,12 +91,12 @@ def update_from_flow(
 
 
 def _solved(H: Float[Tensor, "b 6 6"], g: Float[Tensor, "b 6"]) -> Float[Tensor, "b 6"]:
-    """Damped H x = g by elimination, in operations that every runtime has."""
+    """Solution of damped H x = g by elimination, in operations that every runtime has."""
     damping = DAMPING * H.diagonal(dim1=1, dim2=2).mean(-1) + 1e-6
     unit = torch.eye(6, device=H.device, dtype=H.dtype)
     table = torch.cat((H + damping[:, None, None] * unit, g[..., None]), -1)
     for k in range(6):
         row = table[:, k : k + 1] / table[:, k : k + 1, k : k + 1]
-        # row k stays, divided; the others lose their share of it
+        # row k is divided by its pivot and subtracted from the others
         table = table - (table[:, :, k : k + 1] - unit[k][:, None]) * row
     return table[..., 6]

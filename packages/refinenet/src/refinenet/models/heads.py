@@ -1,4 +1,4 @@
-"""From features to a pose update: the outputs that every network can have, chosen by configuration."""
+"""Heads: from features to a pose update, in the configured parametrisation."""
 
 import torch
 from jaxtyping import Float
@@ -9,11 +9,11 @@ from refinenet.geometry import poses
 from refinenet.geometry.poses import PoseUpdate
 
 ROTATION_BIAS = {"6d": (1.0, 0.0, 0.0, 0.0, 1.0, 0.0), "quaternion": (1.0, 0.0, 0.0, 0.0)}
-"""Outputs that mean no rotation, which heads start with."""
+"""Outputs of the identity rotation, the initial bias of the heads."""
 
 
 def forms(config: NetworkConfig) -> tuple[str, str]:
-    """What the rotation and the translation head put out; where the config leaves it open, the kind's own."""
+    """Outputs of the rotation and the translation head; the kind's default where the config gives none."""
     paper = config.kind == "paper"
     return (
         config.rotation or ("quaternion" if paper else "6d"),
@@ -21,8 +21,8 @@ def forms(config: NetworkConfig) -> tuple[str, str]:
     )
 
 
-def start_linear(head: nn.Linear | nn.Conv2d, bias: tuple[float, ...], std: float) -> None:
-    """Weights of `std` around zero and a bias: a head that begins near one output."""
+def init_head(head: nn.Linear | nn.Conv2d, bias: tuple[float, ...], std: float) -> None:
+    """Initialise a head near a constant output: weights of `std` around zero, and a bias."""
     assert head.bias is not None
     nn.init.normal_(head.weight, std=std)
     with torch.no_grad():
@@ -39,17 +39,17 @@ def pose_update(
     crop: bool,
     confidence: Float[Tensor, "b 1"] | None = None,
 ) -> PoseUpdate:
-    """The update that head outputs stand for, in camera axes about the object's origin.
+    """The pose update of head outputs, in camera axes about the object's origin.
 
     Args:
-        rotation: Six numbers or a quaternion, told apart by their count.
-        translation: As `crop` says.
+        rotation: 6D representation or quaternion, by its length.
+        translation: In the coordinates that `crop` selects.
         T_cam_obj: The hypothesis, metres.
         K_crop: Intrinsics of the patch.
         patch_px: Side of the patch.
-        crop: Rotation in axes turned with the ray through the patch and translation as `geometry.crop_update` has it;
+        crop: Rotation in axes aligned with the ray through the patch and translation as in `poses.crop_update`;
             otherwise both in camera axes, metres.
-        confidence: Logit of how well the hypothesis fits, if there is such a head.
+        confidence: Logit of the hypothesis' confidence, if there is such a head.
     """
     six = rotation.shape[-1] == 6
     R = poses.rotation_from_6d(rotation) if six else poses.rotation_from_quat_wxyz(rotation)

@@ -97,7 +97,7 @@ class _Mixed5(nn.Module):
 
 
 class Stem(nn.Module):
-    """A frozen stem: no gradients, and batch norm in evaluation mode whatever `train` is told.
+    """A frozen stem: no gradients, and batch norm in evaluation mode even after `train`.
 
     Input: (b, 3, h, w) colours as x / 127.5 - 1. At 224 x 224 the output is 25 x 25.
     """
@@ -105,7 +105,7 @@ class Stem(nn.Module):
     c_out: int
 
     def freeze(self) -> None:
-        """Take every parameter from the optimiser's sight and set evaluation mode."""
+        """Exclude every parameter from training and set evaluation mode."""
         self.requires_grad_(False)
         self.eval()
 
@@ -184,17 +184,17 @@ def load_weights(stem: Stem, path: Path) -> None:
         stored = load_file(path)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: cannot be read as backbone weights (safetensors): {error}") from error
-    wanted = stem.state_dict()
+    expected = stem.state_dict()
     chosen = {}
-    for key, tensor in wanted.items():
+    for key, tensor in expected.items():
         if key in stored and stored[key].shape == tensor.shape:
             chosen[key] = stored[key]
         elif key.endswith("num_batches_tracked"):
             chosen[key] = tensor
         else:
-            found = f"shape {tuple(stored[key].shape)}" if key in stored else "nothing"
+            present = f"shape {tuple(stored[key].shape)}" if key in stored else "nothing"
             raise CheckpointError(
-                f"{path}: tensor '{key}': found {found}, expected shape {tuple(tensor.shape)} "
+                f"{path}: tensor '{key}': found {present}, expected shape {tuple(tensor.shape)} "
                 f"({type(stem).__name__}, names as in timm); check backbone.name"
             )
     stem.load_state_dict(chosen)
@@ -212,12 +212,12 @@ def load_pretrained(stem: Stem, name: str, weights: str | None) -> None:
         load_weights(stem, Path(weights))
         return
     if name != "inception_v4":
-        raise ConfigError(f"backbone.name={name} has no weights on the hub that this project trusts: {ways}")
+        raise ConfigError(f"backbone.name={name} has no trusted weights on the hub: {ways}")
     try:
         from huggingface_hub import hf_hub_download
         from huggingface_hub.utils import logging as hub_logging
 
-        hub_logging.set_verbosity_error()  # without a network it logs each of its retries; the error below says it once
+        hub_logging.set_verbosity_error()  # without a network it logs each retry; the error below is enough
         path = hf_hub_download(HUB_REPOSITORY, HUB_FILE)
     except Exception as error:  # the hub's client raises errors of several libraries
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

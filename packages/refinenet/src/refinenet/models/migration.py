@@ -6,7 +6,9 @@ Files are migrated when they are read and never rewritten. Tensor names have not
 from collections.abc import Mapping
 from typing import Any
 
-from refinenet.config import renamed
+from posecore.renamed import migrated_keys
+
+from refinenet.config.renamed import RENAMED
 
 STATE_KEYS = {"held_out_shards": "validation_shards"}
 RECORD_KEYS = {"held_out_scenes": "validation_scenes"}
@@ -14,24 +16,20 @@ METRIC_KEYS = {"visible_share": "visible_fraction", "data_wait_share": "data_wai
 
 
 def migrated_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration in a checkpoint's metadata, under today's keys and values."""
-    return renamed.migrated(config)
+    """The configuration in a checkpoint's metadata."""
+    return migrated_keys(config, RENAMED)
 
 
 def migrated_state(state: Mapping[str, Any]) -> dict[str, Any]:
     """The optimiser state of a step, `optimiser-*.pt`."""
-    return _renamed(state, STATE_KEYS)
+    return migrated_keys(state, STATE_KEYS)
 
 
 def migrated_record(record: Mapping[str, Any]) -> dict[str, Any]:
     """The split of a run, `data.json`."""
-    return _renamed(record, RECORD_KEYS)
+    return migrated_keys(record, RECORD_KEYS)
 
 
 def migrated_metrics(line: Mapping[str, Any]) -> dict[str, Any]:
     """One line of `metrics.jsonl`."""
-    return _renamed(line, METRIC_KEYS)
-
-
-def _renamed(mapping: Mapping[str, Any], keys: Mapping[str, str]) -> dict[str, Any]:
-    return {keys.get(key, key): value for key, value in mapping.items()}
+    return migrated_keys(line, METRIC_KEYS)

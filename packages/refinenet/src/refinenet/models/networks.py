@@ -1,4 +1,4 @@
-"""The networks: PaperNet (frozen stems), CompactNet (matching, for two CPU cores), PlusNet (for a GPU), FlowNet."""
+"""Networks: PaperNet (frozen stems), CompactNet (matching, for two CPU cores), PlusNet (for a GPU), FlowNet."""
 
 import torch
 from jaxtyping import Float, UInt8
@@ -9,7 +9,7 @@ from refinenet.config import NetworkConfig
 from refinenet.geometry.poses import Flow, PoseUpdate
 from refinenet.models.correlation import GradientCorrelation, LocalCorrelation
 from refinenet.models.flow_solver import CELL_PX, surface_points, update_from_flow
-from refinenet.models.heads import ROTATION_BIAS, forms, pose_update, start_linear
+from refinenet.models.heads import ROTATION_BIAS, forms, init_head, pose_update
 from refinenet.models.inception import ConvNorm, InceptionA, make_stem
 
 
@@ -78,11 +78,11 @@ class PaperNet(nn.Module):
 
 
 class CompactNet(nn.Module):
-    """`plus` made small: match scene and hypothesis locally, then heads for 6D rotation, image-plane xy and log z.
+    """Small version of `plus`: local correlation, then heads for 6D rotation, image-plane xy and log z.
 
-    Where each part of the object went is what rotation is read from, and convolutions over the stacked pair would have
-    to learn to compare first. LayerNorm and GELU before the heads: a ReLU there died in training. See
-    `geometry.crop_update` for the output.
+    The rotation follows from the displacement of each part of the object; convolutions over the stacked pair would have
+    to learn the comparison first. LayerNorm and GELU before the heads: a ReLU there died in training. See
+    `poses.crop_update` for the output.
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -98,12 +98,12 @@ class CompactNet(nn.Module):
         rotation, translation = forms(config)
         self.rotation = nn.Linear(config.hidden, len(ROTATION_BIAS[rotation]))
         self.translation = nn.Linear(config.hidden, 3)
-        start_linear(self.rotation, ROTATION_BIAS[rotation], config.head_std)
-        start_linear(self.translation, (0.0, 0.0, 0.0), config.head_std)
+        init_head(self.rotation, ROTATION_BIAS[rotation], config.head_std)
+        init_head(self.translation, (0.0, 0.0, 0.0), config.head_std)
         self.confidence: nn.Linear | None = None
         if config.confidence:
             self.confidence = nn.Linear(config.hidden, 1)
-            start_linear(self.confidence, (0.0,), config.head_std)
+            init_head(self.confidence, (0.0,), config.head_std)
         self.crop, self.patch_px = translation == "crop", config.patch_px
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
@@ -117,7 +117,7 @@ class CompactNet(nn.Module):
 
     @staticmethod
     def _mixer(channels: int, config: NetworkConfig) -> nn.Module:
-        """From an eighth of the patch's size to what the heads read."""
+        """From an eighth of the patch's size to the head features."""
         mixed, last = config.widths
         return nn.Sequential(
             ConvNorm(channels, mixed, 1),
@@ -127,7 +127,7 @@ class CompactNet(nn.Module):
         )
 
     def features(self, inputs: NetworkInput) -> Float[Tensor, "b h"]:
-        """What the heads read; runs in reduced precision under autocast."""
+        """Head features; runs in reduced precision under autocast."""
         scene = self.scene(normalised(inputs.scene_rgb).contiguous(memory_format=torch.channels_last))
         hypothesis = self.hypothesis(normalised(inputs.hypothesis_rgb).contiguous(memory_format=torch.channels_last))
         matches = self.correlation(self.match_hypothesis(hypothesis), self.match_scene(scene))
@@ -184,19 +184,18 @@ class PlusNet(CompactNet):
         )
 
 
-MOST_CERTAIN = 5.0
-"""Bound of the logarithm of a certainty, 1 / px, either way."""
+MAX_LOG_CERTAINTY = 5.0
+"""Bound of the absolute log certainty, 1 / px."""
 
 
 class FlowNet(nn.Module):
-    """Sees where each part of the hypothesis is in the scene, and how surely; the pose that fits that best follows.
+    """Flow from render to scene with its certainty, and the pose update that fits the flow best.
 
-    The hypothesis comes with its depth, so every point that is seen elsewhere says something about the pose, and the
-    pose itself is solved for, not guessed: see `flow.update_from_flow`. Gradients are matched as they are
-    (`GradientCorrelation`), with learned features beside them; then an hourglass from a quarter of the patch's
-    resolution to a sixteenth and back.
+    The hypothesis' depth makes each flow vector a constraint on the pose, which is solved for, not regressed: see
+    `flow_solver.update_from_flow`. Fixed gradient features (`GradientCorrelation`) and learned appearance features are
+    concatenated; an hourglass from a quarter of the patch's resolution to a sixteenth and back follows.
 
-    Source: flow between render and image with the pose solved from it, as in PFA (Hu et al., ECCV 2022) and GenFlow
+    Source: pose solved from the flow between render and image, as in PFA (Hu et al., ECCV 2022) and GenFlow
     (Moon et al., CVPR 2024); certainties from a likelihood.
     """
 
@@ -206,17 +205,17 @@ class FlowNet(nn.Module):
         self.scene, self.hypothesis = self._encoder(3, config), self._encoder(5, config)
         self.correlation = GradientCorrelation(config.match_radius)
         self.appearance = nn.Conv2d(2 * config.encoder[1], config.appearance_channels, 1)
-        seen = self.correlation.channels + config.appearance_channels
-        self.fine = nn.Sequential(ConvNorm(seen, wide, 1), ConvNorm(wide, wide, 3, padding=1))
+        channels = self.correlation.channels + config.appearance_channels
+        self.fine = nn.Sequential(ConvNorm(channels, wide, 1), ConvNorm(wide, wide, 3, padding=1))
         self.coarse, self.coarsest = self._down(wide, wider), self._down(wider, wider)
         self.join_coarse = ConvNorm(2 * wider, wider, 3, padding=1)
         self.join_fine = ConvNorm(wider + wide, wide, 3, padding=1)
         self.head = nn.Conv2d(wide, 5, 3, padding=1)
-        start_linear(self.head, (0.0,) * 5, config.head_std)
+        init_head(self.head, (0.0,) * 5, config.head_std)
         self.confidence: nn.Sequential | None = None
         if config.confidence:
             last = nn.Linear(wider, 1)
-            start_linear(last, (0.0,), config.head_std)
+            init_head(last, (0.0,), config.head_std)
             self.confidence = nn.Sequential(nn.Linear(wider + wide, wider), nn.GELU(), last)
         self.patch_px = config.patch_px
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -233,10 +232,10 @@ class FlowNet(nn.Module):
     def _down(c_in: int, c_out: int) -> nn.Module:
         return nn.Sequential(ConvNorm(c_in, c_out, 3, stride=2, padding=1), ConvNorm(c_out, c_out, 3, padding=1))
 
-    def _seen(
+    def _flow_features(
         self, inputs: NetworkInput, depth_m: Float[Tensor, "b p p"], half_m: Float[Tensor, " b"]
     ) -> tuple[Float[Tensor, "b 5 n n"], Float[Tensor, "b c"]]:
-        """Head outputs, and the features of the whole; runs in reduced precision under autocast."""
+        """Head outputs, and pooled features for the confidence; runs in reduced precision under autocast."""
         mask = (depth_m > 0).float()
         relief = ((depth_m - inputs.T_cam_obj[:, 2, 3, None, None]) / half_m[:, None, None]).clamp(-1.5, 1.5) * mask
         render = torch.cat((normalised(inputs.hypothesis_rgb), mask[:, None], relief[:, None]), 1)
@@ -254,12 +253,14 @@ class FlowNet(nn.Module):
     def forward(self, inputs: NetworkInput) -> PoseUpdate:
         """The update of each hypothesis."""
         depth_m, T = inputs.hypothesis_depth_m, inputs.T_cam_obj
-        assert depth_m is not None  # every stream fills it where the config says `uses_depth`
-        half_m = 0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]  # of the window, where the object is
-        seen, whole = self._seen(inputs, depth_m, half_m)
+        assert depth_m is not None  # filled by every stream for a config with `uses_depth`
+        half_m = (
+            0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]
+        )  # half the window's side at the object's depth
+        outputs, pooled = self._flow_features(inputs, depth_m, half_m)
         with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit
-            x = seen.float().permute(0, 2, 3, 1).flatten(1, 2)
-            diagonal = torch.exp(x[..., 2:4].clamp(-MOST_CERTAIN, MOST_CERTAIN))
+            x = outputs.float().permute(0, 2, 3, 1).flatten(1, 2)
+            diagonal = torch.exp(x[..., 2:4].clamp(-MAX_LOG_CERTAINTY, MAX_LOG_CERTAINTY))
             p_cam_m, uv_px, on_object = surface_points(depth_m, inputs.K_crop)
             flow = Flow(
                 p_cam_m, uv_px, on_object, offset_px=CELL_PX * x[..., :2],
@@ -267,7 +268,7 @@ class FlowNet(nn.Module):
             )  # fmt: skip
             update = update_from_flow(flow, T, inputs.K_crop, half_m)
             if self.confidence is not None:
-                update = update._replace(confidence=self.confidence(whole.float())[:, 0])
+                update = update._replace(confidence=self.confidence(pooled.float())[:, 0])
         return update
 
 
@@ -280,5 +281,5 @@ NETWORKS: dict[str, type[PaperNet | CompactNet | FlowNet]] = {
 
 
 def make_network(config: NetworkConfig) -> nn.Module:
-    """The network a config describes, with fresh weights (the stem's too: see `backbone.load_pretrained`)."""
+    """The configured network, with random weights (the stem's too: see `inception.load_pretrained`)."""
     return NETWORKS[config.kind](config)

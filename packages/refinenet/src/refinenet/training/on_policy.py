@@ -31,7 +31,6 @@ from refinenet.image.crops import hypothesis_window
 from refinenet.image.masks import visible_mask_iou
 from refinenet.training.losses import sample_distance
 
-Array = np.ndarray
 MAX_SCALE_CHANGE = 2.0
 """Largest ratio of old and new window side; beyond it the update has diverged, and the pair stays as it is."""
 
@@ -50,15 +49,15 @@ class _Renders:
     pixel.
     """
 
-    kept: Int[Array, " s"]
-    T_cam_obj: Float[Array, "s 4 4"]
-    K_crop: Float[Array, "s 3 3"]
-    rgb: UInt8[Array, "s p p 3"]
-    depth_m: Float[Array, "s p p"]
-    outline: Bool[Array, "s p p"]
-    bits: UInt8[Array, "s p p"]
+    kept: Int[np.ndarray, " s"]
+    T_cam_obj: Float[np.ndarray, "s 4 4"]
+    K_crop: Float[np.ndarray, "s 3 3"]
+    rgb: UInt8[np.ndarray, "s p p 3"]
+    depth_m: Float[np.ndarray, "s p p"]
+    outline: Bool[np.ndarray, "s p p"]
+    bits: UInt8[np.ndarray, "s p p"]
     uv_px: Float[Tensor, "s p p 2"]
-    scale: Float[Array, " s"]
+    scale: Float[np.ndarray, " s"]
 
 
 class OnPolicyHypotheses:
@@ -124,8 +123,8 @@ class OnPolicyHypotheses:
 
     @torch.no_grad()
     def _updated(
-        self, network: nn.Module, batch: Batch, rows: Int[Array, " r"], rng: np.random.Generator
-    ) -> tuple[Batch, Int[Array, " s"]]:
+        self, network: nn.Module, batch: Batch, rows: Int[np.ndarray, " r"], rng: np.random.Generator
+    ) -> tuple[Batch, Int[np.ndarray, " s"]]:
         """The batch after one update of some rows, and the rows whose updated hypothesis is visible."""
         chosen = torch.from_numpy(rows).to(batch.sample_ids.device)
         inputs = batch.inputs.mapped(lambda x: x[chosen])
@@ -151,7 +150,7 @@ class OnPolicyHypotheses:
         inputs, targets = NetworkInput(*put(batch.inputs, new.inputs)), LossTarget(*put(batch.target, new.target))  # type: ignore[arg-type]
         return batch._replace(inputs=inputs, target=targets), rows[renders.kept]
 
-    def _render(self, T: Float[Array, "r 4 4"], K_crop: Tensor, target: LossTarget) -> _Renders | None:
+    def _render(self, T: Float[np.ndarray, "r 4 4"], K_crop: Tensor, target: LossTarget) -> _Renders | None:
         """Poses rendered in windows of their own; None when no pose is visible."""
         assert target.scene_bits is not None
         K, index = K_crop.double().cpu().numpy(), target.object_index.cpu().numpy()
@@ -185,7 +184,7 @@ class OnPolicyHypotheses:
     def _pairs(self, renders: _Renders, inputs: NetworkInput, target: LossTarget, rng: np.random.Generator) -> Batch:
         """New pairs of the renders, whose colours are not augmented yet, and the old pairs."""
 
-        def real(values: Array | list[Array]) -> Tensor:
+        def real(values: np.ndarray | list[np.ndarray]) -> Tensor:
             return torch.from_numpy(np.asarray(values, np.float32)).to(inputs.K_crop.device)
 
         patch_px, n = self._config.network.patch_px, target.hypothesis_contour_m.shape[1]
@@ -211,7 +210,7 @@ class OnPolicyHypotheses:
         )
         return Batch(new_inputs, new_target, torch.from_numpy(renders.kept))
 
-    def _window(self, K_patch: Float[Array, "3 3"], T: Float[Array, "4 4"], index: int) -> Window | None:
+    def _window(self, K_patch: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "4 4"], index: int) -> Window | None:
         """Window of a pose in the old patch's pixels; None for a pose too near to render or outside the patch."""
         mesh, patch_px = self._meshes[self._obj_ids[index]], self._config.network.patch_px
         if not np.isfinite(T).all() or (T[:3, :3] @ mesh.center_m + T[:3, 3])[2] < mesh.diameter_m:
@@ -223,7 +222,7 @@ class OnPolicyHypotheses:
         return window
 
 
-def _tinted(rgb: UInt8[Array, "s p p 3"], colours: Float[Tensor, "s 3 3"] | None) -> UInt8[Tensor, "s 3 p p"]:
+def _tinted(rgb: UInt8[np.ndarray, "s p p 3"], colours: Float[Tensor, "s 3 3"] | None) -> UInt8[Tensor, "s 3 p p"]:
     """Renders under the colour matrices of the batch's augmentation."""
     values = torch.from_numpy(rgb.astype(np.float32)).permute(0, 3, 1, 2)
     if colours is not None:

@@ -99,7 +99,7 @@ class Trainer:
         return on_device(iter(make_loader(stream, pin=self.device.type == "cuda")), self.device)
 
     def take_step(self, *batches: Batch) -> dict[str, float | Tensor]:
-        """One optimiser step on the mean gradient of one or more batches.
+        """One optimiser step on the mean gradient of its batches.
 
         Returns:
             The mean loss and the gradient's norm, both still on the device, the step's learning rate, and the mean
