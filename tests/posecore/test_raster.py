@@ -100,6 +100,28 @@ def test_a_batch_larger_than_its_framebuffers_is_complete(rasteriser: Rasteriser
     assert (layers.depth_m == layers.depth_m[0]).all()
 
 
+@pytest.mark.parametrize("size_m", [0.002, 0.1, 10.0])
+@pytest.mark.parametrize("diameters", [1.0, 8.0, 103.0, 500.0])
+def test_near_and_far_objects_of_any_size_are_drawn(size_m: float, diameters: float) -> None:
+    """Two coloured plates, a thousandth of their size apart: the front one hides the other, wherever it lies."""
+    half = size_m / 2
+    corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    vertices_m = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, 1e-3 * size_m)])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    rgb = np.repeat([[255, 0, 0], [0, 0, 255]], 4, axis=0).astype(np.uint8)
+    plates = Mesh(vertices_m=vertices_m, faces=faces, normals=np.tile([0.0, 0.0, -1.0], (8, 1)), vertex_rgb=rgb)
+    T = se3.make_T(np.eye(3), np.array([0.0, 0.0, diameters * plates.diameter_m]))
+    K = camera.intrinsics(40 * diameters, 40 * diameters, 32, 32)
+    with Rasteriser({1: plates}) as rasteriser:
+        layers = rasteriser.render(1, K, T[None], 64, 64)
+        scene = rasteriser.render_scene([Instance(obj_id=1, T_cam_obj=T)], K, 64, 64)
+    side_px = 40 / np.sqrt(2)
+    assert layers.mask.sum() == pytest.approx(side_px**2, abs=2 * side_px)
+    assert (layers.rgb[layers.mask][:, 0] > 0).all() and not layers.rgb[layers.mask][:, 2].any()
+    np.testing.assert_allclose(layers.depth_m[layers.mask], T[2, 3], rtol=1e-6)
+    np.testing.assert_array_equal(scene.depth_m, layers.depth_m[0])
+
+
 def test_two_rasterisers_in_one_process_do_not_disturb_each_other(rasteriser: Rasteriser) -> None:
     T = poses(1)
     before = rasteriser.render(1, K, T, 140, 100).depth_m

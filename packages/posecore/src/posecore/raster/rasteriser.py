@@ -141,7 +141,7 @@ class Rasteriser:
             for i in range(start, min(start + _images_at_once(size), n)):
                 targets.append(self._begin(*size, rgb=rgb, index=i - start))
                 instance = Instance(obj_id=int(obj_ids[i]), T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], *size, near_m=self._near_m([instance]), rgb=rgb)
+                self._draw(instance, 0, K[i], *size, self._depth_range_m([instance]), rgb=rgb)
             for i, target in enumerate(targets, start):  # all are drawn before the first is read
                 depth[i] = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., 0]
                 if colours is not None:
@@ -162,9 +162,9 @@ class Rasteriser:
         """Draw several objects into one image."""
         self._set_shading(shading)
         target = self._begin(width_px, height_px, rgb=True)
-        near_m = self._near_m(instances)  # one depth range for all that share a buffer
+        depth_range_m = self._depth_range_m(instances)  # one for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m, rgb=True)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, depth_range_m, rgb=True)
         size = (width_px, height_px)
         colours, layer = self._read_rgb(target, size).copy() if rgb else None, self._read_floats(target, size, 1, 2)
         return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
@@ -205,14 +205,14 @@ class Rasteriser:
         K: Float[Array, "3 3"],
         width_px: int,
         height_px: int,
-        near_m: float,
+        depth_range_m: tuple[float, float],
         *,
         rgb: bool,
     ) -> None:
         mesh = self._mesh(instance.obj_id)
         coloured, depth_only = self._array(instance.obj_id, mesh)
         T = np.asarray(instance.T_cam_obj, np.float64)
-        center_z_m = self._center_z_m(instance)
+        center_z_m, near_m = self._center_z_m(instance), depth_range_m[0]
         if center_z_m + mesh.diameter_m <= near_m:
             return
         # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
@@ -220,7 +220,7 @@ class Rasteriser:
             self._context.enable(moderngl.CULL_FACE)
         else:
             self._context.disable(moderngl.CULL_FACE)
-        clip = _clip_from_cam(K, width_px, height_px, near_m, far_m=100.0)
+        clip = _clip_from_cam(K, width_px, height_px, *depth_range_m)
         program = self._program if rgb else self._depth_program
         program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
         program["cam_from_obj"].write(T.T.astype("f4").tobytes())
@@ -252,10 +252,22 @@ class Rasteriser:
         T = instance.T_cam_obj
         return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
 
-    def _near_m(self, instances: Sequence[Instance]) -> float:
-        """Near plane: close enough to cut nothing in practice, far enough for a 24-bit depth buffer to keep order."""
-        in_front = [z_m for instance in instances if (z_m := self._center_z_m(instance)) > 0]
-        return max(1e-3, 0.05 * min(in_front, default=0.0))
+    def _depth_range_m(self, instances: Sequence[Instance]) -> tuple[float, float]:
+        """Near and far plane: around all instances in front, no nearer than a twentieth of the nearest centre's depth.
+
+        A 24-bit depth buffer keeps the order of surfaces that are `z^2 (far - near) / (near far 2^24)` apart: 1.2e-7
+        diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8 z.
+        """
+        in_front = [
+            (z_m, self._mesh(instance.obj_id).diameter_m)
+            for instance in instances
+            if (z_m := self._center_z_m(instance)) > 0
+        ]
+        if not in_front:
+            return 1e-3, 1.0
+        nearest_m = 0.99 * min(z_m - diameter_m for z_m, diameter_m in in_front)
+        farthest_m = 1.01 * max(z_m + diameter_m for z_m, diameter_m in in_front)
+        return max(nearest_m, 0.05 * min(z_m for z_m, _ in in_front)), farthest_m
 
     def _mesh(self, obj_id: int) -> Mesh:
         if obj_id not in self._meshes:
