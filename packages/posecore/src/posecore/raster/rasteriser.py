@@ -256,7 +256,8 @@ class Rasteriser:
         """Near and far plane: around all instances in front, no nearer than a twentieth of the nearest centre's depth.
 
         A 24-bit depth buffer keeps the order of surfaces that are `z^2 (far - near) / (near far 2^24)` apart: 1.2e-7
-        diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8 z.
+        diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8
+        z.
         """
         in_front = [
             (z_m, self._mesh(instance.obj_id).diameter_m)
