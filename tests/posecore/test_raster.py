@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 from posecore import camera, se3
 from posecore.errors import RenderError
-from posecore.mesh import Mesh
+from posecore.mesh import Mesh, load_mesh
 from posecore.raster import DirectionalLight, Instance, Rasteriser, Shading, reference
 from scipy.spatial import ConvexHull
 
@@ -65,35 +66,60 @@ def test_mask_is_the_hull_of_the_projected_corners(rasteriser: Rasteriser) -> No
         np.testing.assert_array_equal(mask[clear], outside_px[clear] < 0)
 
 
-def test_a_batch_of_several_objects_equals_renders_of_each(rasteriser: Rasteriser) -> None:
-    T, obj_ids = poses(6), np.array([2, 1, 1, 2, 1, 2])
-    batch = rasteriser.render(obj_ids, K, T, 64, 64, rgb=False)
-    for i, obj_id in enumerate(obj_ids):
-        single = rasteriser.render(int(obj_id), K, T[i : i + 1], 64, 64, rgb=False)
-        assert (batch.mask[i] != single.mask[0]).sum() <= 1
-        both = batch.mask[i] & single.mask[0]
-        assert both.any()
-        np.testing.assert_allclose(batch.depth_m[i][both], single.depth_m[0][both], atol=2e-6)
+def many_meshes(repository: Path) -> dict[int, Mesh]:
+    shapes = (trimesh.creation.icosphere(4, 0.05), trimesh.creation.cone(0.05, 0.1))
+    examples = [load_mesh(repository / "examples" / "objects" / f"{name}.ply") for name in ("tug", "bobbin")]
+    return dict(enumerate([BOX, RING, *map(mesh_of, shapes), *examples], 1))
 
 
-def test_batch_with_one_K_per_pose_equals_single_renders(rasteriser: Rasteriser) -> None:
-    T, rng = poses(7), np.random.default_rng(3)
-    Ks = np.stack([camera.intrinsics(*rng.uniform(200, 300, 2), *rng.uniform(25, 40, 2)) for _ in T])
-    batch = rasteriser.render(2, Ks, T, 64, 64)
-    for i in range(len(T)):
-        single = rasteriser.render(2, Ks[i], T[i : i + 1], 64, 64)
-        # a tile's place in the atlas moves the last bits of interpolated values
-        assert (batch.mask[i] != single.mask[0]).sum() <= 1
-        both = batch.mask[i] & single.mask[0]
-        np.testing.assert_allclose(batch.depth_m[i][both], single.depth_m[0][both], atol=2e-6)
-        assert batch.rgb is not None and single.rgb is not None
-        assert np.abs(batch.rgb[i][both].astype(int) - single.rgb[0][both]).max() <= 1
+@pytest.mark.parametrize("side_px", [48, 64])
+def test_a_render_does_not_depend_on_its_batch_mates(repository: Path, side_px: int) -> None:
+    """A pose alone, and at each index of a batch of 64 of six meshes: the same bytes."""
+    T, rng = poses(64, seed=4), np.random.default_rng(3)
+    Ks = np.stack([camera.intrinsics(*rng.uniform(200, 300, 2), *rng.uniform(20, 30, 2)) for _ in T])
+    meshes = many_meshes(repository)
+    obj_ids = np.arange(64) % len(meshes) + 1
+    with Rasteriser(meshes) as rasteriser:
+        alone = [rasteriser.render(int(obj_ids[i]), Ks[i], T[i : i + 1], side_px, side_px) for i in range(64)]
+        for shift in (0, 1, 17, 63):
+            order = (np.arange(64) + shift) % 64
+            batch = rasteriser.render(obj_ids[order], Ks[order], T[order], side_px, side_px)
+            outlines = rasteriser.render(obj_ids[order], Ks[order], T[order], side_px, side_px, rgb=False)
+            for row, i in enumerate(order):
+                np.testing.assert_array_equal(batch.depth_m[row], alone[i].depth_m[0])
+                np.testing.assert_array_equal(batch.rgb[row], alone[i].rgb[0])
+                np.testing.assert_array_equal(outlines.mask[row], alone[i].mask[0])
 
 
-def test_a_batch_larger_than_one_atlas_is_complete(rasteriser: Rasteriser) -> None:
-    T = np.repeat(poses(1), 9, axis=0)
-    layers = rasteriser.render(1, camera.intrinsics(1500, 1500, 512, 512), T, 1024, 1024, rgb=False)
-    assert (layers.mask.reshape(9, -1).sum(axis=1) == layers.mask[0].sum()).all()
+@pytest.mark.parametrize(("n", "side_px"), [(9, 1024), (130, 32)])
+def test_a_batch_larger_than_its_framebuffers_is_complete(rasteriser: Rasteriser, n: int, side_px: int) -> None:
+    T = np.repeat(poses(1), n, axis=0)
+    K = camera.intrinsics(1.5 * side_px, 1.5 * side_px, side_px / 2, side_px / 2)
+    layers = rasteriser.render(1, K, T, side_px, side_px, rgb=False)
+    assert layers.mask[0].any()
+    assert (layers.depth_m == layers.depth_m[0]).all()
+
+
+@pytest.mark.parametrize("size_m", [0.002, 0.1, 10.0])
+@pytest.mark.parametrize("diameters", [1.0, 8.0, 103.0, 500.0])
+def test_near_and_far_objects_of_any_size_are_drawn(size_m: float, diameters: float) -> None:
+    """Two coloured plates, a thousandth of their size apart: the front one hides the other, wherever it lies."""
+    half = size_m / 2
+    corners = np.array([[-half, -half], [half, -half], [half, half], [-half, half]])
+    vertices_m = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, 1e-3 * size_m)])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+    rgb = np.repeat([[255, 0, 0], [0, 0, 255]], 4, axis=0).astype(np.uint8)
+    plates = Mesh(vertices_m=vertices_m, faces=faces, normals=np.tile([0.0, 0.0, -1.0], (8, 1)), vertex_rgb=rgb)
+    T = se3.make_T(np.eye(3), np.array([0.0, 0.0, diameters * plates.diameter_m]))
+    K = camera.intrinsics(40 * diameters, 40 * diameters, 32, 32)
+    with Rasteriser({1: plates}) as rasteriser:
+        layers = rasteriser.render(1, K, T[None], 64, 64)
+        scene = rasteriser.render_scene([Instance(obj_id=1, T_cam_obj=T)], K, 64, 64)
+    side_px = 40 / np.sqrt(2)
+    assert layers.mask.sum() == pytest.approx(side_px**2, abs=2 * side_px)
+    assert (layers.rgb[layers.mask][:, 0] > 0).all() and not layers.rgb[layers.mask][:, 2].any()
+    np.testing.assert_allclose(layers.depth_m[layers.mask], T[2, 3], rtol=1e-6)
+    np.testing.assert_array_equal(scene.depth_m, layers.depth_m[0])
 
 
 def test_two_rasterisers_in_one_process_do_not_disturb_each_other(rasteriser: Rasteriser) -> None:

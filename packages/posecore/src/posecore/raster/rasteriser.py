@@ -5,6 +5,7 @@ engine. Pixels are sampled at their centres (+0.5), without antialiasing, so mas
 `posecore.raster.reference` is the reference implementation that tests hold this against.
 """
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from types import TracebackType
@@ -22,7 +23,12 @@ from posecore.raster.shaders import DEPTH_FRAGMENT_SHADER, DEPTH_VERTEX_SHADER, 
 
 Array = np.ndarray
 P, R = ParamSpec("P"), TypeVar("R")
-ATLAS_SIDE_PX = 2048  # tiles of one batch share a framebuffer of at most this side: one read-back for all of them
+MAX_IMAGES = 64
+"""Framebuffers of one image size."""
+MAX_PIXELS = 2048 * 2048
+"""Pixels in all framebuffers of one image size."""
+MAX_SIZES = 8
+"""Image sizes whose framebuffers are kept; the oldest goes."""
 
 
 def _drawing(
@@ -61,7 +67,7 @@ class Rasteriser:
             self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
         self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
         self._textures: dict[int, moderngl.Texture] = {}
-        self._targets: dict[tuple[int, int, bool], moderngl.Framebuffer] = {}
+        self._targets: dict[tuple[tuple[int, int], bool], list[moderngl.Framebuffer]] = {}
 
     def __enter__(self) -> "Rasteriser":
         return self
@@ -95,7 +101,7 @@ class Rasteriser:
             held.release()
         for obj_id in list(self._arrays):
             self._release(obj_id)
-        for target in self._targets.values():
+        for target in itertools.chain.from_iterable(self._targets.values()):
             self._free(target)
         self._targets.clear()
 
@@ -127,25 +133,19 @@ class Rasteriser:
         obj_ids = np.broadcast_to(obj_id, n)
         colours = np.empty((n, height_px, width_px, 3), np.uint8) if rgb else None
         depth = np.empty((n, height_px, width_px), np.float32)
-        columns = max(1, ATLAS_SIDE_PX // width_px)
-        rows = max(1, ATLAS_SIDE_PX // height_px)
         if rgb:
             self._set_shading(shading)
-        for start in range(0, n, columns * rows):
-            stop = min(start + columns * rows, n)
-            used_columns = min(columns, stop - start)
-            used_rows = -(-(stop - start) // used_columns)
-            target = self._begin(used_columns * width_px, used_rows * height_px, rgb=rgb)
-            for i in range(start, stop):
-                row, column = divmod(i - start, used_columns)
-                target.viewport = (column * width_px, row * height_px, width_px, height_px)
+        size = (width_px, height_px)
+        for start in range(0, n, _images_at_once(size)):
+            targets = []
+            for i in range(start, min(start + _images_at_once(size), n)):
+                targets.append(self._begin(*size, rgb=rgb, index=i - start))
                 instance = Instance(obj_id=int(obj_ids[i]), T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], width_px, height_px, near_m=self._near_m([instance]), rgb=rgb)
-            size = (used_columns * width_px, used_rows * height_px)
-            atlas_depth = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., :1]
-            depth[start:stop] = _tiles(atlas_depth, used_rows, used_columns)[: stop - start, ..., 0]
-            if colours is not None:
-                colours[start:stop] = _tiles(self._read_rgb(target, size), used_rows, used_columns)[: stop - start]
+                self._draw(instance, 0, K[i], *size, self._depth_range_m([instance]), rgb=rgb)
+            for i, target in enumerate(targets, start):  # all are drawn before the first is read
+                depth[i] = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., 0]
+                if colours is not None:
+                    colours[i] = self._read_rgb(target, size)
         return Layers(rgb=colours, depth_m=depth)
 
     @_drawing
@@ -162,10 +162,9 @@ class Rasteriser:
         """Draw several objects into one image."""
         self._set_shading(shading)
         target = self._begin(width_px, height_px, rgb=True)
-        target.viewport = (0, 0, width_px, height_px)
-        near_m = self._near_m(instances)  # one depth range for all that share a buffer
+        depth_range_m = self._depth_range_m(instances)  # one for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, near_m, rgb=True)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, depth_range_m, rgb=True)
         size = (width_px, height_px)
         colours, layer = self._read_rgb(target, size).copy() if rgb else None, self._read_floats(target, size, 1, 2)
         return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
@@ -178,21 +177,26 @@ class Rasteriser:
         program["light_direction"].value = [light.direction_cam for light in lights] + padding
         program["light_rgb"].value = [light.rgb for light in lights] + padding
 
-    def _begin(self, width_px: int, height_px: int, *, rgb: bool) -> moderngl.Framebuffer:
-        target = self._targets.get((width_px, height_px, rgb))
-        if target is None:
-            if len(self._targets) >= 8:  # sizes vary with batch and crop; a few are kept, the oldest goes
-                self._free(self._targets.pop(next(iter(self._targets))))
-            size = (width_px, height_px)
+    def _begin(self, width_px: int, height_px: int, *, rgb: bool, index: int = 0) -> moderngl.Framebuffer:
+        """A cleared framebuffer, the one that is drawn to from now on.
+
+        Each image of a batch has a framebuffer of its own. In a shared one the viewport's offset would move the last
+        bits of every interpolated value, so that a pose's render would depend on its index in the batch.
+        """
+        size = (width_px, height_px)
+        if (size, rgb) not in self._targets and len(self._targets) >= MAX_SIZES:
+            for target in self._targets.pop(next(iter(self._targets))):
+                self._free(target)
+        targets = self._targets.setdefault((size, rgb), [])
+        if index == len(targets):
             colours = [self._context.texture(size, 4), self._context.texture(size, 2, dtype="f4")]
             target = self._context.framebuffer(
                 colours if rgb else [self._context.texture(size, 1, dtype="f4")], self._context.depth_texture(size)
             )
-            self._targets[width_px, height_px, rgb] = target
-        target.use()
-        target.viewport = (0, 0, width_px, height_px)
-        target.clear(0.0, 0.0, 0.0, 0.0)
-        return target
+            targets.append(target)
+        targets[index].use()
+        targets[index].clear(0.0, 0.0, 0.0, 0.0)
+        return targets[index]
 
     def _draw(
         self,
@@ -201,14 +205,14 @@ class Rasteriser:
         K: Float[Array, "3 3"],
         width_px: int,
         height_px: int,
-        near_m: float,
+        depth_range_m: tuple[float, float],
         *,
         rgb: bool,
     ) -> None:
         mesh = self._mesh(instance.obj_id)
         coloured, depth_only = self._array(instance.obj_id, mesh)
         T = np.asarray(instance.T_cam_obj, np.float64)
-        center_z_m = self._center_z_m(instance)
+        center_z_m, near_m = self._center_z_m(instance), depth_range_m[0]
         if center_z_m + mesh.diameter_m <= near_m:
             return
         # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
@@ -216,7 +220,7 @@ class Rasteriser:
             self._context.enable(moderngl.CULL_FACE)
         else:
             self._context.disable(moderngl.CULL_FACE)
-        clip = _clip_from_cam(K, width_px, height_px, near_m, far_m=100.0)
+        clip = _clip_from_cam(K, width_px, height_px, *depth_range_m)
         program = self._program if rgb else self._depth_program
         program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
         program["cam_from_obj"].write(T.T.astype("f4").tobytes())
@@ -248,10 +252,23 @@ class Rasteriser:
         T = instance.T_cam_obj
         return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
 
-    def _near_m(self, instances: Sequence[Instance]) -> float:
-        """Near plane: close enough to cut nothing in practice, far enough for a 24-bit depth buffer to keep order."""
-        in_front = [z_m for instance in instances if (z_m := self._center_z_m(instance)) > 0]
-        return max(1e-3, 0.05 * min(in_front, default=0.0))
+    def _depth_range_m(self, instances: Sequence[Instance]) -> tuple[float, float]:
+        """Near and far plane: around all instances in front, no nearer than a twentieth of the nearest centre's depth.
+
+        A 24-bit depth buffer keeps the order of surfaces that are `z^2 (far - near) / (near far 2^24)` apart: 1.2e-7
+        diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8
+        z.
+        """
+        in_front = [
+            (z_m, self._mesh(instance.obj_id).diameter_m)
+            for instance in instances
+            if (z_m := self._center_z_m(instance)) > 0
+        ]
+        if not in_front:
+            return 1e-3, 1.0
+        nearest_m = 0.99 * min(z_m - diameter_m for z_m, diameter_m in in_front)
+        farthest_m = 1.01 * max(z_m + diameter_m for z_m, diameter_m in in_front)
+        return max(nearest_m, 0.05 * min(z_m for z_m, _ in in_front)), farthest_m
 
     def _mesh(self, obj_id: int) -> Mesh:
         if obj_id not in self._meshes:
@@ -311,8 +328,6 @@ def _clip_from_cam(
     )
 
 
-def _tiles(atlas: Array, rows: int, columns: int) -> Array:
-    """Split (rows*h, columns*w, c) into (rows*columns, h, w, c)."""
-    height, width, channels = atlas.shape
-    grid = atlas.reshape(rows, height // rows, columns, width // columns, channels)
-    return np.asarray(grid.swapaxes(1, 2).reshape(rows * columns, height // rows, width // columns, channels))
+def _images_at_once(size: tuple[int, int]) -> int:
+    """Images of one size that have a framebuffer at the same time."""
+    return max(1, min(MAX_IMAGES, MAX_PIXELS // (size[0] * size[1])))
