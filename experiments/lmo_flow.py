@@ -26,8 +26,8 @@ SETS = (17, 18, 19)
 """Seeds of the sets of frames, each of other altered meshes."""
 PATCHES = "--set patch_px=160"
 FRAMES = (
-    "--objects-per-frame 6 8 --preset tabletop --set distance.min=5 --set background.photo_share=0.85 "
-    "--set tabletop.near_share=0.5 --set tabletop.hover_diameter=[0,0.05] --set tabletop.gap_diameter=[0,0.05] "
+    "--objects-per-frame 6 8 --preset tabletop --set distance.min=5 --set background.photo_fraction=0.85 "
+    "--set tabletop.near_fraction=0.5 --set tabletop.hover_diameter=[0,0.05] --set tabletop.gap_diameter=[0,0.05] "
     "--set tabletop.size_diameter=[6,10] --set tabletop.distractors=[2,5] --set tabletop.elevation_deg=[12,50]"
 )
 """Crowded, so that half of the objects are hidden in part."""

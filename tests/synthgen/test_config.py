@@ -2,7 +2,7 @@ import pytest
 import yaml
 from posecore import config as config_tools
 from posecore.errors import ConfigError
-from synthgen.config import SynthConfig, load_config, preset_names
+from synthgen.config import RENAMED_KEYS, CutConfig, SynthConfig, load_config, load_cut_config, migrate, preset_names
 
 
 def test_every_preset_resolves_and_survives_a_round_trip():
@@ -41,6 +41,39 @@ def test_a_preset_file_is_read(tmp_path):
 def test_a_wrong_key_or_value_is_named(overrides, named):
     with pytest.raises(ConfigError, match=named):
         load_config("default", overrides)
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED_KEYS.items())
+def test_a_renamed_key_is_refused_with_its_new_name(old, new, tmp_path):
+    group, key = old.split(".")
+    with pytest.raises(ConfigError, match=rf"--set: the key {old} was renamed; write {new}"):
+        load_config("default", [f"{old}=0.5"])
+    (tmp_path / "mine.yaml").write_text(f"{group}: {{{key}: 0.5}}\n")
+    with pytest.raises(ConfigError, match=rf"mine.yaml: the key {old} was renamed; write {new}"):
+        load_config(str(tmp_path / "mine.yaml"))
+
+
+def test_a_renamed_key_of_cut_pairs_is_refused_with_its_new_name():
+    with pytest.raises(ConfigError, match=r"--set: the key perturbation.easy_share was renamed"):
+        load_cut_config(["perturbation.easy_share=0.5"])
+    assert load_cut_config(["scale=1.5"], {"padding": 0.4, "seed": None}) == CutConfig(scale=1.5, padding=0.4)
+
+
+@pytest.mark.parametrize("config", [load_config("tabletop", ["sequence.min_period_s=3"]), CutConfig(padding=0.4)])
+def test_a_stored_configuration_with_old_keys_is_migrated(config):
+    stored = config_tools.to_dict(config)
+    old_key = {new: old.partition(".")[2] for old, new in RENAMED_KEYS.items()}
+    old = {
+        group: {old_key.get(f"{group}.{key}", key): value for key, value in values.items()}
+        if isinstance(values, dict)
+        else values
+        for group, values in stored.items()
+    }
+    assert "easy_share" in old["perturbation"]
+    assert migrate(old) == stored
+    assert list(migrate(old)["perturbation"]) == list(stored["perturbation"])
+    assert migrate(stored) == stored
+    assert config_tools.build(type(config), migrate(old), "card") == config
 
 
 def test_an_unknown_preset_lists_the_known_ones():

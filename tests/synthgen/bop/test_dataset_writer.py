@@ -236,6 +236,17 @@ def test_another_dataset_is_refused(written, config_of, tug, tmp_path):
         write_dataset(tmp_path, config_of(), {1: tug}, plan)
 
 
+def test_a_dataset_of_an_earlier_version_with_old_keys_is_continued(written, config_of, tug):
+    card = written / "synthgen.json"
+    before, tree_before = card.read_text(), tree(written)
+    card.write_text(before.replace('"easy_fraction"', '"easy_share"').replace('"min_period_s"', '"smoothness_s"'))
+    write_dataset(written, config_of(), {1: tug}, FramePlan(frames=3))
+    with pytest.raises(DatasetError, match="config differ"):
+        write_dataset(written, config_of("seed=9"), {1: tug}, FramePlan(frames=3))
+    card.write_text(before)
+    assert tree(written) == tree_before
+
+
 def test_photographs_are_compared_by_content(tmp_path, config_of, tug):
     photos = []
     for i in range(2):

@@ -55,7 +55,7 @@ def test_objects_on_a_table_stand_on_it_beside_each_other(layouts):
     _, targets, made = layouts(
         "scene.kind=tabletop",
         "occluders.front=[0, 0]",
-        "tabletop.near_share=0",
+        "tabletop.near_fraction=0",
         "tabletop.size_diameter=[10, 12]",
         "tabletop.distractors=[1, 3]",
     )

@@ -10,7 +10,7 @@ from synthgen.draw.target import make_targets
 from synthgen.inputs.assets import Assets
 
 FRAMES = 150
-SETTINGS = ("tabletop.tables=2", "frames.objects=[2, 3]", "frames.instances=3", "sequence.pass_every_s=2")
+SETTINGS = ("tabletop.tables=2", "frames.objects=[2, 3]", "frames.instances=3", "sequence.occluder_period_s=2")
 
 
 def test_waves_keep_their_bounds():
@@ -51,7 +51,7 @@ def test_nothing_jumps(filmed):
     for number in range(len(views[0].layout.labelled)):
         T = np.stack([v.T_cam_ref @ v.layout.labelled[number].T_cam_obj for v in views])
         turn = np.degrees(se3.rotation_angle_rad(T[1:, :3, :3] @ T[:-1, :3, :3].swapaxes(-1, -2))) / dt
-        assert turn.max() <= config.sequence.max_turn_deg_s + 1e-6
+        assert turn.max() <= config.sequence.max_angular_speed_deg_s + 1e-6
         centre = se3.apply(T, target.mesh.center_m[None])[:, 0]
         velocity = np.diff(centre, axis=0) / dt
         acceleration = np.diff(velocity, axis=0) / dt

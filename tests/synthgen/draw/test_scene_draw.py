@@ -100,7 +100,7 @@ def test_lamps_add_up_to_the_drawn_brightness(config_of, tug_target):
     assert total == pytest.approx(1.0)
 
 
-def test_share_inside():
+def test_fraction_inside():
     from synthgen.config import CameraConfig
 
     camera = CameraConfig().camera()
@@ -130,21 +130,25 @@ def test_an_object_that_is_rejected_is_drawn_again(config_of, tug_target):
         assert len(ids) == 1
 
 
-def test_materials_have_their_shares(config_of, tug_target):
-    config = config_of("material.textureless_share=0.3", "material.random_colour_share=0.4", "material.hue_shift=0")
+def test_materials_have_their_fractions(config_of, tug_target):
+    config = config_of(
+        "material.textureless_fraction=0.3", "material.random_colour_fraction=0.4", "material.hue_shift=0"
+    )
     looks = [draw(config, tug_target, i).material for i in range(200)]
     own = [m for m in looks if m.base_rgb is None]
     patterned = [m for m in looks if m.pattern is not None]
     assert len(own) / 200 == pytest.approx(0.3, abs=0.09)
     assert len(patterned) / 200 == pytest.approx(0.2, abs=0.08)
     rng = np.random.default_rng(0)
-    mean = replace(config.material, textureless_share=1.0, random_colour_share=0.0, saturation=(1, 1), value=(1, 1))
+    mean = replace(
+        config.material, textureless_fraction=1.0, random_colour_fraction=0.0, saturation=(1, 1), value=(1, 1)
+    )
     np.testing.assert_allclose(scene_draw.draw_material(rng, mean, tug_target).base_rgb, tug_target.mean_rgb, atol=1e-6)
     assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in looks if m.base_rgb is not None)
 
 
-def test_panoramas_light_and_show_their_shares_and_stand_upright(config_of, tug_target):
-    config = config_of("lights.hdri_share=0.6", "background.hdri_share=0.5", "view.viewpoint=upright")
+def test_panoramas_light_and_show_in_their_fractions_and_stand_upright(config_of, tug_target):
+    config = config_of("lights.hdri_fraction=0.6", "background.hdri_fraction=0.5", "view.viewpoint=upright")
     assets = Assets(hdris=("a.hdr", "b.hdr"))
     drawn = [scene_draw.draw_scene(config, [tug_target], assets, Purpose.PAIRS, i, 0) for i in range(150)]
     lit = [d for d in drawn if d.environment is not None]

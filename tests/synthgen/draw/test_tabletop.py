@@ -39,7 +39,7 @@ def target(tug, config_of):
 
 
 def test_objects_lie_on_the_table_and_touch_it(config_of, target):
-    for draw in draws(config_of(*TABLETOP, "tabletop.near_share=0"), target):
+    for draw in draws(config_of(*TABLETOP, "tabletop.near_fraction=0"), target):
         half = target.tables[draw.around[0].mesh_key].vertices_m.max(axis=0)
         for thing in (None, *draw.around[1:]):
             points = on_table(draw, thing)
@@ -65,7 +65,7 @@ def test_nothing_on_the_table_stands_in_something_else(config_of, target):
 
 
 def test_near_objects_hover_within_their_range_in_any_orientation(config_of, target):
-    config = config_of(*TABLETOP, "tabletop.near_share=1", "tabletop.hover_diameter=[0.1, 0.4]")
+    config = config_of(*TABLETOP, "tabletop.near_fraction=1", "tabletop.hover_diameter=[0.1, 0.4]")
     lowest = [on_table(draw, None)[:, 2].min() / target.mesh.diameter_m for draw in draws(config, target)]
     assert min(lowest) >= 0.1 - 1e-9
     assert max(lowest) <= 0.4 + 1e-9
@@ -83,7 +83,7 @@ def test_the_camera_looks_down_within_the_elevations_and_distances(config_of, ta
 
 
 def test_upright_objects_stand(config_of, target):
-    for draw in draws(config_of(*TABLETOP, "view.viewpoint=upright", "tabletop.near_share=0"), target, 10):
+    for draw in draws(config_of(*TABLETOP, "view.viewpoint=upright", "tabletop.near_fraction=0"), target, 10):
         T_table_obj = inverse(draw.around[0].T_cam_obj) @ draw.T_cam_obj
         np.testing.assert_allclose(T_table_obj[:3, 2], [0, 0, 1], atol=1e-9)
 
@@ -92,7 +92,7 @@ def test_mixed_scenes_have_their_share_and_keep_their_kind_when_drawn_again(conf
     config = config_of(
         *TABLETOP,
         "scene.kind=mixed",
-        "scene.tabletop_share=0.25",
+        "scene.tabletop_fraction=0.25",
         "occluders.props=[1, 1]",
         "tabletop.distractors=[0, 0]",
     )

@@ -12,8 +12,8 @@ PLAIN = ("occluders.front=[0, 0]", "occluders.props=[0, 0]")
 SHARP = (
     "sensor.blur_sigma_px=[0, 0]",
     "sensor.noise_sigma=[0, 0]",
-    "sensor.motion_share=0",
-    "sensor.jpeg_share=0",
+    "sensor.motion_fraction=0",
+    "sensor.jpeg_fraction=0",
 )
 
 
@@ -68,7 +68,7 @@ def test_the_window_is_fixed_and_centred_on_the_hypothesis(maker_of, tug_target)
 @pytest.mark.parametrize("patch_px", [48, 300])  # coarser and finer than the camera's own pixels
 def test_the_picture_shows_the_object_inside_its_contour(maker_of, patch_px):
     """The colours of S change at the contour: an image that is mirrored or half a pixel off fails."""
-    maker = maker_of(f"patch_px={patch_px}", *PLAIN, *SHARP, "sensor.exposure_ev=[0, 0]", "background.photo_share=0")
+    maker = maker_of(f"patch_px={patch_px}", *PLAIN, *SHARP, "sensor.exposure_ev=[0, 0]", "background.photo_fraction=0")
     object_on_black = []
     for scene_index in range(4):
         s = maker.samples(scene_index)
@@ -175,6 +175,6 @@ def test_a_configuration_that_accepts_nothing_says_what_to_change(maker_of, monk
         maker_of("view.min_inside=1.0", "camera.fx=9000", "camera.fy=9000").samples(0)
     monkeypatch.setattr("synthgen.pairs.pair_maker.MAX_ATTEMPTS", 5)
     monkeypatch.setattr("synthgen.pairs.pair_maker.MAX_HYPOTHESIS_ATTEMPTS", 2)
-    far = maker_of("perturbation.max_translation_diameter=2", "perturbation.easy_share=0", "window.padding=0")
+    far = maker_of("perturbation.max_translation_diameter=2", "perturbation.easy_fraction=0", "window.padding=0")
     with pytest.raises(ConfigError, match=r"no hypothesis.*left the window.*max_translation_diameter \(is 2\)"):
         concatenate(far.samples(index) for index in range(20))

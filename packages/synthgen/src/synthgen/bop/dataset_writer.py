@@ -30,7 +30,7 @@ from posecore.mesh import Mesh
 from posecore.processes import behave_as_worker, interrupts_ignored
 
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
-from synthgen.config import SynthConfig
+from synthgen.config import SynthConfig, migrate
 from synthgen.draw.target import Target, make_targets
 from synthgen.engines.blender.paths import forget_blenders_paths
 from synthgen.inputs.assets import Assets
@@ -359,8 +359,9 @@ def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], plan: 
     file = folder / CARD
     try:
         if file.is_file():
-            found = json.loads(file.read_text(encoding="utf-8"))
-            different = [k for k in card if found.get(k) != json.loads(json.dumps(card[k]))]
+            stored = json.loads(file.read_text(encoding="utf-8"))
+            stored["config"] = migrate(stored.get("config", {}))
+            different = [k for k in card if stored.get(k) != json.loads(json.dumps(card[k]))]
             if different:
                 raise DatasetError(
                     f"{folder}: holds another dataset (its {', '.join(different)} differ); choose another --out, or "

@@ -262,7 +262,7 @@ def ceiling_lights(
     overhead has between half and nine tenths. See `sampling.draw_lights` for the units.
     """
     brightness = math.exp(rng.uniform(*np.log(config.brightness)))
-    share, overhead = rng.uniform(*config.ambient_share), rng.uniform(0.5, 0.9)
+    share, overhead = rng.uniform(*config.ambient_fraction), rng.uniform(0.5, 0.9)
     R = T_ref_level[:3, :3]
     elevation, azimuth = math.asin(rng.uniform(*np.sin(np.deg2rad([5.0, 89.0])))), rng.uniform(0, 2 * math.pi)
     side = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth)])
@@ -352,7 +352,7 @@ def _beside(
     only_this = {table.mesh_key: base.target.tables[table.mesh_key]}
     setting = tabletop.set_object(
         rng,
-        replace(config.tabletop, near_share=0.0),
+        replace(config.tabletop, near_fraction=0.0),
         config.view,
         target.rests[target.obj_id],
         target.mesh.diameter_m,

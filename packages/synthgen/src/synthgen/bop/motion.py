@@ -137,13 +137,14 @@ class Motion:
         self._centre_m = self._balls.of(layout.labelled[0])[0]
         rng = self._stream(Subject.MOTION)
         settings = config.sequence
-        turn = math.radians(settings.max_turn_deg_s) * (1.0 if layout.on_table else 0.5)
+        turn = math.radians(settings.max_angular_speed_deg_s) * (1.0 if layout.on_table else 0.5)
         self._draw_place(rng)
         self._draw_direction(rng, turn)
         self._drifts = () if layout.on_table else tuple(self._draw_drift(rng, i, turn) for i in self._numbers)
-        self._light_turn = draw_turn(rng, _LIGHT_TURN_RAD, math.radians(20.0), settings.smoothness_s)
+        self._light_turn = draw_turn(rng, _LIGHT_TURN_RAD, math.radians(20.0), settings.min_period_s)
         self._light_swing = tuple(
-            draw_wave(rng, settings.light_swing, settings.light_swing, settings.smoothness_s) for _ in layout.lights
+            draw_wave(rng, settings.light_variation, settings.light_variation, settings.min_period_s)
+            for _ in layout.lights
         )
         self._shutter = rng.uniform(*settings.shutter)
         self._passing = lru_cache(maxsize=4)(self._draw_passing)
@@ -219,7 +220,7 @@ class Motion:
         )
         speed_m_s = settings.max_speed_diameter_s * self._first.mesh.diameter_m * rng.dirichlet(np.ones(3))
         self._waves = [
-            draw_wave(rng, 1.0, speed / max(way, 1e-12), settings.smoothness_s)
+            draw_wave(rng, 1.0, speed / max(way, 1e-12), settings.min_period_s)
             for speed, way in zip(speed_m_s, ways_m, strict=True)
         ]
 
@@ -228,7 +229,7 @@ class Motion:
 
     def _draw_direction(self, rng: np.random.Generator, max_turn_rad_s: float) -> None:
         """Where the camera looks from: over a table and upright by elevation, azimuth and roll, else any rotation."""
-        config, smooth = self.config, self.config.sequence.smoothness_s
+        config, smooth = self.config, self.config.sequence.min_period_s
         self._is_level = self.layout.on_table or config.view.viewpoint == "upright"
         if not self._is_level:
             self._R_start = random_rotation(rng)
@@ -257,15 +258,15 @@ class Motion:
         gap_m = min((float(np.linalg.norm(own[0] - c)) - own[1] - r for c, r in map(self._balls.of, rest)), default=0.0)
         room_m = _FREE_SHARE * max(gap_m, 0.0) / math.sqrt(3.0) if number else 0.0  # the first one steers the camera
         speed_m_s = settings.max_speed_diameter_s * self._first.mesh.diameter_m / 3
-        x, y, z = (draw_wave(rng, room_m, speed_m_s, settings.smoothness_s) for _ in range(3))
-        return Drift(turn=draw_turn(rng, math.pi, max_turn_rad_s, settings.smoothness_s), shift_m=(x, y, z))
+        x, y, z = (draw_wave(rng, room_m, speed_m_s, settings.min_period_s) for _ in range(3))
+        return Drift(turn=draw_turn(rng, math.pi, max_turn_rad_s, settings.min_period_s), shift_m=(x, y, z))
 
     def _lights(self, t_s: float) -> tuple[Light, ...]:
         T = make_T(self._light_turn(t_s), np.zeros(3))
         T[:3, 3] = self._centre_m - T[:3, :3] @ self._centre_m
         return tuple(
-            replace(moved_light(light, T), strength=light.strength * (1 + swing(t_s)))
-            for light, swing in zip(self.layout.lights, self._light_swing, strict=True)
+            replace(moved_light(light, T), strength=light.strength * (1 + wave(t_s)))
+            for light, wave in zip(self.layout.lights, self._light_waves, strict=True)
         )
 
     def _blur(self, t_s: float) -> tuple[float, float]:
@@ -279,7 +280,7 @@ class Motion:
         return float(math.hypot(dx, dy)), math.atan2(dy, dx)
 
     def _passing_at(self, t_s: float) -> SceneObject | None:
-        span_s = self.config.sequence.pass_every_s
+        span_s = self.config.sequence.occluder_period_s
         passing = self._passing(int(t_s // span_s)) if span_s else None
         return None if passing is None else self._passing_shape(passing, t_s)
 
@@ -300,7 +301,7 @@ class Motion:
 
     def _draw_passing(self, number: int) -> Passing | None:
         """The shape that passes in the given span of time; none where every try touches something."""
-        span_s, rng = self.config.sequence.pass_every_s, self._stream(Subject.OCCLUDERS, number)
+        span_s, rng = self.config.sequence.occluder_period_s, self._stream(Subject.OCCLUDERS, number)
         shapes = self._first.shapes
         keys = sorted(shapes)
         middle_s = (number + rng.uniform(0.4, 0.6)) * span_s

@@ -59,11 +59,10 @@ def cut(
     synthgen cut my_images --out shards --hypotheses detections.csv
     synthgen cut my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
     """
-    from posecore import config as config_tools
     from posecore.bop import BopDataset, splits_of
     from posecore.shard import ShardWriter
 
-    from synthgen.config import CutConfig
+    from synthgen.config import load_cut_config
     from synthgen.machine import size_text
     from synthgen.pairs import cut_plan
     from synthgen.pairs.cut import cut_pairs
@@ -71,9 +70,7 @@ def cut(
     from synthgen.run import lock
     from synthgen.run.estimate import check_free_space
 
-    given = {key: value for key, value in values.items() if value is not None}
-    mapping = config_tools.apply_overrides({}, overrides) | given
-    config = config_tools.build(CutConfig, mapping, "settings")
+    config = load_cut_config(overrides, values)
     if split is None and len(there := splits_of(dataset)) > 1:
         raise click.UsageError(
             f"{dataset} has the splits {', '.join(there)}: name one with --split, not one that you report results on"

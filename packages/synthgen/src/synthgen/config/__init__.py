@@ -4,10 +4,11 @@ Ranges are (low, high) pairs drawn uniformly unless said otherwise. Sizes are in
 the field's name ends in `_diameter`, so that one preset serves a 3 cm screw and a 2 m chair.
 """
 
-from synthgen.config.cut import CutConfig
+from synthgen.config.cut import CutConfig, load_cut_config
 from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.recipe import SynthConfig, load_config, preset_names
+from synthgen.config.renamed_keys import RENAMED_KEYS, migrate, refuse_renamed
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -19,6 +20,7 @@ from synthgen.config.surroundings import (
 )
 
 __all__ = [
+    "RENAMED_KEYS",
     "BackgroundConfig",
     "CameraConfig",
     "CutConfig",
@@ -36,5 +38,8 @@ __all__ = [
     "ViewConfig",
     "WindowConfig",
     "load_config",
+    "load_cut_config",
+    "migrate",
     "preset_names",
+    "refuse_renamed",
 ]

@@ -1,10 +1,14 @@
 """Configuration of pairs that are cut out of annotated images."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
+
+from posecore import config as config_tools
 
 from synthgen.config.geometry import PerturbationConfig
 from synthgen.config.ranges import MAX_PATCH_PX, check
+from synthgen.config.renamed_keys import refuse_renamed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,3 +60,19 @@ class CutConfig:
         check("images_per_scene", self.images_per_scene, 0)
         check("scale", self.scale, 1.0, 8.0)
         check("padding", self.padding, 0.0, 4.0)
+
+
+def load_cut_config(overrides: Sequence[str] = (), values: Mapping[str, Any] | None = None) -> CutConfig:
+    """Resolve `key=value` overrides and option values (in rising priority) to a configuration.
+
+    Args:
+        overrides: Assignments such as `perturbation.max_angle_deg=20`.
+        values: Top-level values from command-line options; None entries are left out.
+
+    Raises:
+        ConfigError: Unknown key or value, or a key with a new name; the message names it.
+    """
+    mapping = config_tools.apply_overrides({}, overrides)
+    refuse_renamed(mapping, "--set")
+    mapping.update({k: v for k, v in (values or {}).items() if v is not None})
+    return config_tools.build(CutConfig, mapping, "settings")

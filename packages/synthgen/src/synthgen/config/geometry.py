@@ -99,20 +99,20 @@ class PerturbationConfig:
     Attributes:
         max_angle_deg: The angle is uniform in 0 to this, about a random axis.
         max_translation_diameter: The object moves in a random direction, the length uniform in 0 to this.
-        easy_share: Share of hypotheses whose two bounds are multiplied by `easy_scale`, so that a refiner also sees
+        easy_fraction: Share of hypotheses whose two bounds are multiplied by `easy_scale`, so that a refiner also sees
             starts that are nearly right.
         easy_scale: That factor.
     """
 
     max_angle_deg: float = 40.0
     max_translation_diameter: float = 0.25
-    easy_share: float = 0.2
+    easy_fraction: float = 0.2
     easy_scale: float = 0.25
 
     def __post_init__(self) -> None:
         check("max_angle_deg", self.max_angle_deg, 0.0, 180.0)
         check("max_translation_diameter", self.max_translation_diameter, 0.0, 2.0)
-        check("easy_share", self.easy_share, 0.0, 1.0)
+        check("easy_fraction", self.easy_fraction, 0.0, 1.0)
         check("easy_scale", self.easy_scale, 0.0, 1.0)
 
 

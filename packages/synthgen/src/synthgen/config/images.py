@@ -37,27 +37,27 @@ class SequenceConfig:
 
     Attributes:
         fps: Images a second.
-        max_turn_deg_s: Bound on its angular speed.
+        max_angular_speed_deg_s: Bound on its angular speed.
         max_speed_diameter_s: Bound on its box centre's speed.
-        smoothness_s: Nothing swings faster than with this period.
-        pass_every_s: A shape passes before it once in every such span; 0 for never.
-        light_swing: Largest change of a lamp's strength either way, as a share.
+        min_period_s: Nothing swings faster than with this period.
+        occluder_period_s: A shape passes before it once in every such span; 0 for never.
+        light_variation: Largest change of a lamp's strength either way, as a share.
         shutter: Share of the time between two images that the shutter is open: what motion blur covers.
     """
 
     fps: float = 30.0
-    max_turn_deg_s: float = 90.0
+    max_angular_speed_deg_s: float = 90.0
     max_speed_diameter_s: float = 3.0
-    smoothness_s: float = 2.0
-    pass_every_s: float = 4.0
-    light_swing: float = 0.4
+    min_period_s: float = 2.0
+    occluder_period_s: float = 4.0
+    light_variation: float = 0.4
     shutter: Range = (0.0, 0.5)
 
     def __post_init__(self) -> None:
         check("fps", self.fps, 0.1, 10_000.0)
-        check("max_turn_deg_s", self.max_turn_deg_s, 0.0, 3600.0)
+        check("max_angular_speed_deg_s", self.max_angular_speed_deg_s, 0.0, 3600.0)
         check("max_speed_diameter_s", self.max_speed_diameter_s, 0.0, 100.0)
-        check("smoothness_s", self.smoothness_s, 0.05, 3600.0)
-        check("pass_every_s", self.pass_every_s, 0.0, 3600.0)
-        check("light_swing", self.light_swing, 0.0, 0.9)
+        check("min_period_s", self.min_period_s, 0.05, 3600.0)
+        check("occluder_period_s", self.occluder_period_s, 0.0, 3600.0)
+        check("light_variation", self.light_variation, 0.0, 0.9)
         check_range("shutter", self.shutter, 0.0, 1.0)

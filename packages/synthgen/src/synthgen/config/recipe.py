@@ -12,6 +12,7 @@ from posecore.files import data_spec
 from synthgen.config.geometry import CameraConfig, DistanceConfig, PerturbationConfig, ViewConfig, WindowConfig
 from synthgen.config.images import FrameConfig, SequenceConfig
 from synthgen.config.ranges import MAX_PATCH_PX, check
+from synthgen.config.renamed_keys import refuse_renamed
 from synthgen.config.surroundings import (
     BackgroundConfig,
     LightConfig,
@@ -109,7 +110,7 @@ def load_config(
         values: Top-level values from command-line options; None entries are left out.
 
     Raises:
-        ConfigError: Unknown preset, key or value; the message names it.
+        ConfigError: Unknown preset, key or value, or a key with a new name; the message names it.
     """
     if preset.endswith((".yaml", ".yml")) or Path(preset).is_file():
         where, mapping = preset, config_tools.load_yaml(preset)
@@ -119,6 +120,8 @@ def load_config(
         raise ConfigError(
             f"--preset {preset}: there is no such preset; choose one of {', '.join(preset_names())} or a .yaml file"
         )
+    refuse_renamed(mapping, where)
+    refuse_renamed(config_tools.apply_overrides({}, overrides), "--set")
     mapping = config_tools.apply_overrides(mapping, overrides)
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
     return config_tools.build(SynthConfig, mapping, where)

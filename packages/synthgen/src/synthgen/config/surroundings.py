@@ -15,14 +15,14 @@ class SceneConfig:
     Attributes:
         kind: 'cutout' has the object in mid air over a background, with shapes floating around it; 'tabletop' has it on
             or near a textured plane, among things that lie there; 'mixed' draws one of the two for each scene.
-        tabletop_share: Share of tabletop scenes, only for 'mixed'.
+        tabletop_fraction: Share of tabletop scenes, only for 'mixed'.
     """
 
     kind: Literal["cutout", "tabletop", "mixed"] = "cutout"
-    tabletop_share: float = 0.5
+    tabletop_fraction: float = 0.5
 
     def __post_init__(self) -> None:
-        check("tabletop_share", self.tabletop_share, 0.0, 1.0)
+        check("tabletop_fraction", self.tabletop_fraction, 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +31,7 @@ class TabletopConfig:
 
     Attributes:
         elevation_deg: Camera elevation above the table, uniform on the sphere's zone.
-        near_share: Share of scenes with the object in any orientation, its lowest point above the table by
+        near_fraction: Share of scenes with the object in any orientation, its lowest point above the table by
             `hover_diameter`, instead of at rest.
         hover_diameter: Height of that lowest point; 0 touches.
         tables: Number of different tables made for a dataset.
@@ -42,7 +42,7 @@ class TabletopConfig:
     """
 
     elevation_deg: Range = (20.0, 80.0)
-    near_share: float = 0.25
+    near_fraction: float = 0.25
     hover_diameter: Range = (0.0, 0.25)
     tables: int = 12
     size_diameter: Range = (4.0, 10.0)
@@ -51,7 +51,7 @@ class TabletopConfig:
 
     def __post_init__(self) -> None:
         check_range("elevation_deg", self.elevation_deg, 1.0, 90.0)
-        check("near_share", self.near_share, 0.0, 1.0)
+        check("near_fraction", self.near_fraction, 0.0, 1.0)
         check_range("hover_diameter", self.hover_diameter, 0.0, 2.0)
         check("tables", self.tables, 1, 200)
         check_range("size_diameter", self.size_diameter, 2.0, 40.0)
@@ -64,29 +64,29 @@ class LightConfig:
     """Lamps around the object.
 
     Attributes:
-        hdri_share: Share of scenes lit by a panorama instead of lamps, where a folder of panoramas is given; its
+        hdri_fraction: Share of scenes lit by a panorama instead of lamps, where a folder of panoramas is given; its
             brightness is drawn from `brightness`, its turn about the vertical uniformly.
         count: Number of lamps.
         brightness: Linear radiance of a white surface that faces all the light, drawn uniformly in its logarithm.
-        ambient_share: Share of it that comes evenly from all around.
+        ambient_fraction: Share of it that comes evenly from all around.
         colour: How far a lamp's colour may leave white, 0 to 1.
         distance_diameter: Distance of the lamps from the object.
         size: A lamp's size as a share of its distance; small is hard shadows.
     """
 
-    hdri_share: float = 0.5
+    hdri_fraction: float = 0.5
     count: IntRange = (1, 3)
     brightness: Range = (0.5, 1.6)
-    ambient_share: Range = (0.15, 0.7)
+    ambient_fraction: Range = (0.15, 0.7)
     colour: float = 0.35
     distance_diameter: Range = (2.0, 8.0)
     size: Range = (0.02, 0.6)
 
     def __post_init__(self) -> None:
-        check("hdri_share", self.hdri_share, 0.0, 1.0)
+        check("hdri_fraction", self.hdri_fraction, 0.0, 1.0)
         check_range("count", self.count, 0, 16)
         check_range("brightness", self.brightness, 1e-3, 100.0)
-        check_range("ambient_share", self.ambient_share, 0.0, 1.0)
+        check_range("ambient_fraction", self.ambient_fraction, 0.0, 1.0)
         check("colour", self.colour, 0.0, 1.0)
         check_range("distance_diameter", self.distance_diameter, 1.0)
         check_range("size", self.size, 1e-3, 2.0)
@@ -97,9 +97,9 @@ class MaterialConfig:
     """Variation of the target's surface around its own colours.
 
     Attributes:
-        textureless_share: Share of scenes in which the object has its mean colour all over.
-        random_colour_share: Share of scenes in which its colours are random: half of them one colour, half a procedural
-            texture of two.
+        textureless_fraction: Share of scenes in which the object has its mean colour all over.
+        random_colour_fraction: Fraction of scenes in which its colours are random: half are plain, half have a
+            procedural texture of two colours.
         hue_shift: Largest hue rotation in turns, either way.
         saturation: Factor on the saturation.
         value: Factor on the brightness.
@@ -108,8 +108,8 @@ class MaterialConfig:
         specular: Principled specular level.
     """
 
-    textureless_share: float = 0.0
-    random_colour_share: float = 0.0
+    textureless_fraction: float = 0.0
+    random_colour_fraction: float = 0.0
     hue_shift: float = 0.04
     saturation: Range = (0.7, 1.3)
     value: Range = (0.75, 1.2)
@@ -118,8 +118,8 @@ class MaterialConfig:
     specular: Range = (0.1, 0.7)
 
     def __post_init__(self) -> None:
-        check("textureless_share", self.textureless_share, 0.0, 1.0)
-        check("random_colour_share", self.random_colour_share, 0.0, 1.0 - self.textureless_share)
+        check("textureless_fraction", self.textureless_fraction, 0.0, 1.0)
+        check("random_colour_fraction", self.random_colour_fraction, 0.0, 1.0 - self.textureless_fraction)
         check("hue_shift", self.hue_shift, 0.0, 0.5)
         for name in ("saturation", "value"):
             check_range(name, getattr(self, name), 0.0, 4.0)
@@ -171,17 +171,17 @@ class BackgroundConfig:
     """What lies behind.
 
     Attributes:
-        hdri_share: Share of the scenes lit by a panorama that show it as well.
-        photo_share: Share of the other scenes over a photograph where a folder of photographs is given; the rest is
+        hdri_fraction: Share of the scenes lit by a panorama that show it as well.
+        photo_fraction: Share of the other scenes over a photograph where a folder of photographs is given; the rest is
             drawn.
     """
 
-    hdri_share: float = 0.5
-    photo_share: float = 0.7
+    hdri_fraction: float = 0.5
+    photo_fraction: float = 0.7
 
     def __post_init__(self) -> None:
-        check("hdri_share", self.hdri_share, 0.0, 1.0)
-        check("photo_share", self.photo_share, 0.0, 1.0)
+        check("hdri_fraction", self.hdri_fraction, 0.0, 1.0)
+        check("photo_fraction", self.photo_fraction, 0.0, 1.0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,9 +194,9 @@ class SensorConfig:
         noise_sigma: Noise in display units [0, 1].
         blur_sigma_px: Defocus.
         motion_px: Length of straight motion blur.
-        motion_share: Share of scenes with motion blur.
+        motion_fraction: Share of scenes with motion blur.
         jpeg_quality: Quality range.
-        jpeg_share: Share of scenes that go through JPEG.
+        jpeg_fraction: Share of scenes that go through JPEG.
     """
 
     exposure_ev: Range = (-0.5, 0.5)
@@ -204,9 +204,9 @@ class SensorConfig:
     noise_sigma: Range = (0.0, 0.03)
     blur_sigma_px: Range = (0.0, 0.9)
     motion_px: Range = (1.0, 5.0)
-    motion_share: float = 0.15
+    motion_fraction: float = 0.15
     jpeg_quality: IntRange = (60, 98)
-    jpeg_share: float = 0.5
+    jpeg_fraction: float = 0.5
 
     def __post_init__(self) -> None:
         check_range("exposure_ev", self.exposure_ev, -10.0, 10.0)
@@ -215,5 +215,5 @@ class SensorConfig:
         check_range("blur_sigma_px", self.blur_sigma_px, 0.0, 20.0)
         check_range("motion_px", self.motion_px, 0.0, 64.0)
         check_range("jpeg_quality", self.jpeg_quality, 1, 100)
-        for name in ("motion_share", "jpeg_share"):
+        for name in ("motion_fraction", "jpeg_fraction"):
             check(name, getattr(self, name), 0.0, 1.0)

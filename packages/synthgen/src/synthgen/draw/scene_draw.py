@@ -112,7 +112,7 @@ def draw_scene(
             occluders.look,
         )
     lights, ambient_rgb = draw_lights(rng(Subject.LIGHTS), config.lights, centre, diameter_m)
-    background = draw_background(rng(Subject.BACKGROUND), config.background.photo_share, assets.photos)
+    background = draw_background(rng(Subject.BACKGROUND), config.background.photo_fraction, assets.photos)
     environment, seen = draw_environment(rng(Subject.ENVIRONMENT), config, assets.hdris, T_cam_table[:3, :3])
     if environment is not None:
         lights, ambient_rgb = (), (0.0, 0.0, 0.0)
@@ -145,7 +145,7 @@ def target_of(seed: int, purpose: Purpose, scene_index: int, count: int) -> int:
 
 def _is_tabletop(config: SynthConfig, purpose: Purpose, scene_index: int) -> bool:
     """Whether a scene has a table; like its target it keeps that over all attempts."""
-    share = {"cutout": 0.0, "tabletop": 1.0, "mixed": config.scene.tabletop_share}[config.scene.kind]
+    share = {"cutout": 0.0, "tabletop": 1.0, "mixed": config.scene.tabletop_fraction}[config.scene.kind]
     return bool(stream(config.seed, purpose, Subject.KIND, scene_index).random() < share)
 
 
@@ -242,7 +242,7 @@ def draw_hypothesis(
     The box centre and not the origin is the pivot, because meshes whose origin lies far off their surface would swing
     out of the window. For a mesh centred on its origin the two are the same.
     """
-    ease = config.easy_scale if rng.random() < config.easy_share else 1.0
+    ease = config.easy_scale if rng.random() < config.easy_fraction else 1.0
     angle = math.radians(config.max_angle_deg) * ease * rng.uniform()
     length_m = config.max_translation_diameter * mesh.diameter_m * ease * rng.uniform()
     dR = rotation_from_rotvec(random_direction(rng) * angle)
@@ -263,7 +263,7 @@ def draw_lights(
     """
     brightness = math.exp(rng.uniform(*np.log(config.brightness)))
     count = int(rng.integers(config.count[0], config.count[1] + 1))
-    share = rng.uniform(*config.ambient_share) if count else 1.0
+    share = rng.uniform(*config.ambient_fraction) if count else 1.0
     ambient = _tinted(rng, config.colour / 2) * brightness * share
     weights = rng.dirichlet(np.ones(count)) if count else np.zeros(0)
     lights = []
@@ -301,16 +301,16 @@ def draw_material(rng: np.random.Generator, config: MaterialConfig, target: Targ
         specular=float(rng.uniform(*config.specular)),
     )
     kind = rng.random()
-    if kind < config.textureless_share:
+    if kind < config.textureless_fraction:
         mean = _vector(target.mean_rgb)
         hue, saturation, value = colorsys.rgb_to_hsv(*mean)
         changed = ((hue + material.hue_shift) % 1.0, saturation * material.saturation, value * material.value)
         base = colorsys.hsv_to_rgb(changed[0], min(changed[1], 1.0), min(changed[2], 1.0))
-    elif kind < config.textureless_share + config.random_colour_share:
+    elif kind < config.textureless_fraction + config.random_colour_fraction:
         base = _any_colour(rng)
     else:
         return material
-    is_patterned = kind >= config.textureless_share and rng.random() < 0.5
+    is_patterned = kind >= config.textureless_fraction and rng.random() < 0.5
     pattern = _pattern(rng, target.mesh.diameter_m) if is_patterned else None
     return replace(material, base_rgb=base, pattern=pattern, hue_shift=0.0, saturation=1.0, value=1.0)
 
@@ -344,18 +344,18 @@ def draw_environment(
         hdris: Panoramas.
         R_cam_level: Rotation from a frame whose z axis points up; the panorama stands upright in it.
     """
-    if not hdris or rng.random() >= config.lights.hdri_share:
+    if not hdris or rng.random() >= config.lights.hdri_fraction:
         return None, False
     path = hdris[int(rng.integers(len(hdris)))]
     turn = rotation_from_rotvec(np.array([0.0, 0.0, rng.uniform(0, 2 * math.pi)]))
     strength = math.exp(rng.uniform(*np.log(config.lights.brightness)))
-    seen = bool(rng.random() < config.background.hdri_share)
+    seen = bool(rng.random() < config.background.hdri_fraction)
     return Environment(path=path, R_cam_env=R_cam_level @ turn, strength=strength), seen
 
 
-def draw_background(rng: np.random.Generator, photo_share: float, photos: Sequence[str]) -> Background:
+def draw_background(rng: np.random.Generator, photo_fraction: float, photos: Sequence[str]) -> Background:
     """Draw which background; a photograph only where some are given."""
-    seed, is_photo = child_seed(rng), rng.random() < photo_share
+    seed, is_photo = child_seed(rng), rng.random() < photo_fraction
     if photos and is_photo:
         return Background(kind="photo", seed=seed, path=photos[int(rng.integers(len(photos)))])
     return Background(kind="procedural", seed=seed)
@@ -368,10 +368,10 @@ def draw_sensor(rng: np.random.Generator, config: SensorConfig) -> Sensor:
         white_balance=_vector(np.exp(rng.normal(0.0, config.white_balance, 3))),
         noise_sigma=float(rng.uniform(*config.noise_sigma)),
         blur_sigma_px=float(rng.uniform(*config.blur_sigma_px)),
-        motion_px=float(rng.uniform(*config.motion_px)) if rng.random() < config.motion_share else 0.0,
+        motion_px=float(rng.uniform(*config.motion_px)) if rng.random() < config.motion_fraction else 0.0,
         motion_angle_rad=float(rng.uniform(0, math.pi)),
         jpeg_quality=int(rng.integers(config.jpeg_quality[0], config.jpeg_quality[1] + 1))
-        if rng.random() < config.jpeg_share
+        if rng.random() < config.jpeg_fraction
         else None,
         seed=child_seed(rng),
     )

@@ -77,7 +77,7 @@ def set_object(
     """Choose a table and put an object on it, at rest, or in any orientation near it."""
     keys = sorted(tables, reverse=True)
     key = keys[int(rng.integers(len(keys)))]
-    is_near, hover = rng.random() < config.near_share, rng.uniform(*config.hover_diameter) * diameter_m
+    is_near, hover = rng.random() < config.near_fraction, rng.uniform(*config.hover_diameter) * diameter_m
     if is_near:
         R = random_rotation(rng)
     elif view.viewpoint == "upright":
