@@ -1,7 +1,7 @@
 """Inline SVG drawings from the fenced blocks `flow` and `bars` of a page.
 
-A line of a `flow` block is a chain: `[file] -> command -> [file | note]`. Files are in brackets; a name that occurs again
-is the same box. A line of a `bars` block is `label | value | text of the value`, or `label | value`.
+A line of a `flow` block is a chain: `[file] -> command -> [file | note]`. Files are in brackets; a repeated name is the
+same box. A line of a `bars` block is `label | value | text of the value`, or `label | value`.
 """
 
 import html
@@ -11,8 +11,10 @@ from dataclasses import dataclass, field
 
 CHARACTER_PX = 7.4
 BOX_PX = 38
-ROW_PX = 58
+ROW_PX = 62
 GAP_PX = 44
+WIDEST_PX = 1000
+"""A wider drawing runs downwards."""
 BAR_PX = 360
 
 
@@ -24,17 +26,14 @@ class _Box:
     note: str
     is_file: bool
     layer: int = 0
-    row: int = 0
+    lane: int = 0
     x: float = 0.0
+    y: float = 0.0
     sources: list[str] = field(default_factory=list)
 
     @property
     def width(self) -> float:
         return 26 + max(CHARACTER_PX * len(self.name), 6.2 * len(self.note))
-
-    @property
-    def y(self) -> float:
-        return 8.0 + ROW_PX * self.row
 
 
 def draw(markdown: str) -> str:
@@ -50,16 +49,23 @@ def _svg_of(drawing: Callable[[str], str]) -> Callable[[re.Match[str]], str]:
 
 
 def flow(text: str) -> str:
-    """Return the drawing of a `flow` block: boxes in columns by their longest way from a source, arrows between them.
+    """Return the drawing of a `flow` block: boxes in layers by their longest way from a source, arrows between them.
+
+    The layers run to the right, or downwards where that would be wider than `WIDEST_PX`.
 
     Raises:
         ValueError: The arrows form a circle.
     """
     boxes = _parse(text)
-    _place(boxes)
+    _set_layers(boxes)
+    _set_lanes(boxes)
+    downwards = _place_rightwards(boxes) > WIDEST_PX
+    if downwards:
+        _place_downwards(boxes)
     width = max(box.x + box.width for box in boxes.values()) + 8
     height = max(box.y for box in boxes.values()) + BOX_PX + 8
-    parts = [_arrow(boxes[source], box) for box in boxes.values() for source in box.sources]
+    arrow = _arrow_down if downwards else _arrow_right
+    parts = [arrow(boxes[source], box) for box in boxes.values() for source in box.sources]
     parts += [_box(box) for box in boxes.values()]
     return _svg(width, height, parts)
 
@@ -77,29 +83,53 @@ def _parse(text: str) -> dict[str, _Box]:
     return boxes
 
 
-def _place(boxes: dict[str, _Box]) -> None:
-    """Set column, row and x of every box."""
+def _set_layers(boxes: dict[str, _Box]) -> None:
     for _ in boxes:
         for box in boxes.values():
             box.layer = max((boxes[source].layer + 1 for source in box.sources), default=0)
     if max(box.layer for box in boxes.values()) >= len(boxes):
         raise ValueError("the arrows of a flow drawing form a circle")
+    for box in boxes.values():  # an input stands beside its first use
+        if not box.sources:
+            box.layer = min((target.layer for target in boxes.values() if box.name in target.sources), default=1) - 1
+
+
+def _set_lanes(boxes: dict[str, _Box]) -> None:
+    """Give each box of a layer another lane, where possible that of its first source."""
+    for layer in range(max(box.layer for box in boxes.values()) + 1):
+        lane = -1
+        for box in (box for box in boxes.values() if box.layer == layer):
+            lane = box.lane = max(lane + 1, min((boxes[source].lane for source in box.sources), default=0))
+
+
+def _place_rightwards(boxes: dict[str, _Box]) -> float:
+    """Set the positions of a drawing with layers as columns; return its width."""
     x = 8.0
     for layer in range(max(box.layer for box in boxes.values()) + 1):
         column = [box for box in boxes.values() if box.layer == layer]
-        row = -1
         for box in column:
-            preferred = min((boxes[source].row for source in box.sources), default=0)
-            row = box.row = max(row + 1, preferred)
-            box.x = x
+            box.x, box.y = x, 8.0 + ROW_PX * box.lane
         x += max(box.width for box in column) + GAP_PX
+    return x - GAP_PX + 8
+
+
+def _place_downwards(boxes: dict[str, _Box]) -> None:
+    """Set the positions of a drawing with layers as rows, boxes centred in their lanes."""
+    x = 8.0
+    for lane in range(max(box.lane for box in boxes.values()) + 1):
+        column = [box for box in boxes.values() if box.lane == lane]
+        width = max((box.width for box in column), default=0.0)
+        for box in column:
+            box.x, box.y = x + (width - box.width) / 2, 8.0 + ROW_PX * box.layer
+        x += width + GAP_PX
 
 
 def _box(box: _Box) -> str:
     kind, radius = ("file", 3) if box.is_file else ("command", 12)
     middle, base = box.x + box.width / 2, box.y + BOX_PX / 2 + 5
     parts = [
-        f'<rect class="{kind}" x="{box.x:.0f}" y="{box.y:.0f}" width="{box.width:.0f}" height="{BOX_PX}" rx="{radius}"/>'
+        f'<rect class="{kind}" x="{box.x:.0f}" y="{box.y:.0f}"'
+        f' width="{box.width:.0f}" height="{BOX_PX}" rx="{radius}"/>'
     ]
     name_y = base - 7 if box.note else base
     parts.append(f'<text x="{middle:.0f}" y="{name_y:.0f}" text-anchor="middle">{html.escape(box.name)}</text>')
@@ -109,13 +139,20 @@ def _box(box: _Box) -> str:
     return "".join(parts)
 
 
-def _arrow(source: _Box, target: _Box) -> str:
+def _arrow_right(source: _Box, target: _Box) -> str:
     x0, y0 = source.x + source.width, source.y + BOX_PX / 2
     x1, y1 = target.x - 7, target.y + BOX_PX / 2
     bend = max(18.0, (x1 - x0) / 2)
     path = f"M{x0:.0f} {y0:.0f}C{x0 + bend:.0f} {y0:.0f} {x1 - bend:.0f} {y1:.0f} {x1:.0f} {y1:.0f}"
-    head = f"M{x1 + 6:.0f} {y1:.0f}l-8 -4v8z"
-    return f'<path class="edge" d="{path}"/><path class="head" d="{head}"/>'
+    return f'<path class="edge" d="{path}"/><path class="head" d="M{x1 + 6:.0f} {y1:.0f}l-8 -4v8z"/>'
+
+
+def _arrow_down(source: _Box, target: _Box) -> str:
+    x0, y0 = source.x + source.width / 2, source.y + BOX_PX
+    x1, y1 = target.x + target.width / 2, target.y - 7
+    bend = max(12.0, (y1 - y0) / 2)
+    path = f"M{x0:.0f} {y0:.0f}C{x0:.0f} {y0 + bend:.0f} {x1:.0f} {y1 - bend:.0f} {x1:.0f} {y1:.0f}"
+    return f'<path class="edge" d="{path}"/><path class="head" d="M{x1:.0f} {y1 + 6:.0f}l-4 -8h8z"/>'
 
 
 def bars(text: str) -> str:

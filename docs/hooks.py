@@ -6,6 +6,7 @@ import importlib
 import inspect
 import re
 import sys
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -86,8 +87,8 @@ def training_keys_page() -> str:
     lines = [
         "# Training keys",
         "",
-        "`--set key=value` changes one key of a preset, `--config FILE` several. The defaults below are those of the "
-        "configuration classes; a preset overrides some. The resolved configuration is written beside every checkpoint.",
+        "`--set key=value` changes one key of a preset, `--config FILE` several. Below are the defaults of the "
+        "configuration classes; presets override some. The resolved configuration is written beside every checkpoint.",
         "",
     ]
     return "\n".join([*lines, *_key_tables(config.TrainConfig, "")])
@@ -95,12 +96,15 @@ def training_keys_page() -> str:
 
 def _key_tables(kind: type, prefix: str) -> list[str]:
     """Markdown tables of a configuration class: its plain keys, then one section for each nested class."""
-    docs, rows, sections = _attribute_docs(kind), [], []
+    docs, types = _attribute_docs(kind), typing.get_type_hints(kind)
+    rows: list[str] = []
+    sections: list[str] = []
     for field in dataclasses.fields(kind):
-        default = field.default_factory() if callable(field.default_factory) else field.default
-        if dataclasses.is_dataclass(default) and not isinstance(default, type):
-            sections += ["", f"## {prefix}{field.name}", "", *_key_tables(type(default), f"{prefix}{field.name}.")]
+        nested = next(filter(dataclasses.is_dataclass, [types[field.name], *typing.get_args(types[field.name])]), None)
+        if nested is not None:
+            sections += ["", f"## {prefix}{field.name}", "", *_key_tables(nested, f"{prefix}{field.name}.")]
         else:
+            default = field.default_factory() if callable(field.default_factory) else field.default
             shown = "" if default is dataclasses.MISSING else f"<code>{_cell(_yaml(default))}</code>"
             rows.append(f"| `{prefix}{field.name}` | {shown} | {_sentence(docs.get(field.name, ''))} |")
     return ["| key | default | meaning |", "|---|---|---|", *rows, *sections]
@@ -115,7 +119,7 @@ def _attribute_docs(kind: type) -> dict[str, str]:
 def _yaml(value: object) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    return f"[{', '.join(map(_yaml, value))}]" if isinstance(value, list | tuple) else str(value)
+    return f"[{', '.join(map(_yaml, value))}]" if isinstance(value, list | tuple) else str(value) or '""'
 
 
 def _sentence(text: str) -> str:
