@@ -12,7 +12,7 @@ MANIFESTS := $(wildcard packages/*/pyproject.toml) ci/requirements-dev.txt ci/co
 export LP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
-.PHONY: help setup venv quickstart test test-fast check lint types format docs objects clean
+.PHONY: help setup venv quickstart test test-fast coverage check lint types format docs objects clean
 
 help: ## This list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1|/' | awk -F'|' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -33,15 +33,19 @@ $(SETUP): $(MANIFESTS) | $(BIN)/python
 quickstart: $(SETUP) ## Render, train, refine and report on the example object, in WORK (quickstart/)
 	$(BIN)/python examples/quickstart.py $(WORK)
 
-test: $(SETUP) ## All tests
-	$(BIN)/python -m pytest -q -n $(JOBS)
+test: $(SETUP) ## All tests, and what the slowest cost
+	$(BIN)/python -m pytest -q -n $(JOBS) --durations=25 $(PYTEST)
 
 test-fast: $(SETUP) ## The tests without the slow ones
 	$(BIN)/python -m pytest -q -n $(JOBS) -m "not slow"
 
-lint: $(SETUP) ## Formatting and lint, without changing anything
+coverage: $(SETUP) ## The fast tests, and which lines of the packages they do not reach
+	$(BIN)/python -m pytest -q -n $(JOBS) -m "not slow" --cov --cov-report=term:skip-covered --cov-report=html:site/coverage
+
+lint: $(SETUP) ## Formatting, lint and structure (ci/structure.py), without changing anything
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+	$(BIN)/python ci/structure.py
 
 types: $(SETUP) ## Static types
 	$(BIN)/mypy

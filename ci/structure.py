@@ -4,8 +4,8 @@
     python ci/structure.py refinenet  # one package
 
 Sizes: modules a folder, lines a module, a function and a command function. Names: public classes of one name,
-words that have a standard term in computer vision (`TERMS`). English: verbs of a person for code (`VERBS`), and "of it",
-"of one", "of them" without their noun, in docstrings, comments, messages and pages.
+words that have a standard term in computer vision (`TERMS`). English: verbs of a person for code (`VERBS`), and
+"of it", "of one", "of them" without their noun, in docstrings, comments, messages and pages.
 """
 
 import ast

@@ -7,6 +7,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import click
@@ -35,6 +36,19 @@ WANTED_UNSEEN = {  # declared though no line imports them
     "zarr",  # what others open a dataset with; tests hold our shard files against it
 }
 TEST_TIME_ORACLES = {"timm"}
+ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
+    "posecore": (
+        "errors se3 files config renamed processes numba_jit ply symmetry mesh simplify window camera contour raster "
+        "store shard bop html command_line"
+    ),
+    "synthgen": "scene engine machine config image inputs engines draw pairs bop run inspect verify cli",
+    "refinenet": (
+        "errors device batch refiner config geometry image models data training baselines refine tracking cli __main__"
+    ),
+    "evalkit": (
+        "error_table inputs pose_errors scores evaluation tables report diff check tracking cli"
+    ),
+}  # fmt: skip
 
 
 def sources(package: str) -> list[Path]:
@@ -126,6 +140,57 @@ def test_package_ships_licence_readme_and_the_common_version(package: str) -> No
     assert versions == {project["version"]}
     own = [name for name in project["dependencies"] if name.startswith("posecore")]
     assert own == ([] if package == "posecore" else [f"posecore=={project['version']}"])
+
+
+def module_name(file: Path, package: str) -> str:
+    inner = file.relative_to(REPOSITORY / "packages" / package / "src").with_suffix("")
+    return ".".join(inner.parts).removesuffix(".__init__")
+
+
+def own_imports(file: Path, package: str) -> Iterator[tuple[str, int]]:
+    """Modules of its own package that a file imports anywhere, with their lines."""
+    modules = {module_name(source, package) for source in sources(package)}
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == package:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                yield inner if inner in modules else node.module, node.lineno
+        elif isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names if alias.name.split(".")[0] == package)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_import_runs_upward(package: str) -> None:
+    """The folders of a package read from top to bottom in the order of its work."""
+    rank = {name: index for index, name in enumerate(ORDER[package].split())}
+    upward = []
+    for file in sources(package):
+        parts = module_name(file, package).split(".")
+        if len(parts) == 1:  # the public face may hand on from anywhere
+            continue
+        for module, line in own_imports(file, package):
+            target = module.split(".")[1:2]
+            if target and rank[target[0]] > rank[parts[1]]:
+                upward.append(f"{file.relative_to(REPOSITORY)}:{line} imports {module}")
+    assert upward == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_modules_import_each_other_in_a_circle(package: str) -> None:
+    graph = {
+        module_name(file, package): {module for module, _ in own_imports(file, package)} for file in sources(package)
+    }
+    faces = {module_name(file, package) for file in sources(package) if file.name == "__init__.py"}
+    graph = {module: imported - {package} - (faces & set(parents(module))) for module, imported in graph.items()}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(f"modules import each other in a circle: {' -> '.join(error.args[1])}")
+
+
+def parents(module: str) -> list[str]:
+    parts = module.split(".")
+    return [".".join(parts[:length]) for length in range(1, len(parts))]
 
 
 def test_data_specs_are_one_folder() -> None:

@@ -15,6 +15,7 @@ from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
 from posecore.raster import Rasteriser
+from synthgen.bop import dataset_writer
 from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import load_config
@@ -301,7 +302,7 @@ def test_depth_steps_grow_for_far_scenes(config_of, meshes):
 
     for overrides, scale in (((), 0.1), (("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0)):
         config = config_of(*overrides)
-        assert write_dataset._depth_scale(config, make_targets(meshes, config)) == scale
+        assert dataset_writer._depth_scale(config, make_targets(meshes, config)) == scale
 
 
 @pytest.mark.blender

@@ -46,7 +46,7 @@ def test_a_sweep_removes_what_killed_processes_left_and_nothing_else(tmp_path, m
     (mine / "layers.exr").write_bytes(b"mine")
     (tmp_path / "synthgen_file").write_text("not a folder")
     code = (
-        "import os\nfrom pathlib import Path\nfrom synthgen.run import scratch\n"
+        "import os\nfrom pathlib import Path\nfrom synthgen.engines.blender import scratch\n"
         f"scratch._SHARED_MEMORY = Path({str(tmp_path)!r})\n"
         "folder, _ = scratch.make_folder()\n(folder / 'layers.exr').write_bytes(b'lost')\nos.kill(os.getpid(), 9)"
     )
