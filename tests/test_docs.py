@@ -2,13 +2,18 @@
 
 import importlib.util
 import re
+import shlex
 import subprocess
 import sys
+from collections.abc import Iterator
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from posecore import config as config_tools
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -20,6 +25,18 @@ def module(name: str):
     sys.modules[spec.name] = loaded  # dataclasses look their module up
     spec.loader.exec_module(loaded)
     return loaded
+
+
+def pages() -> list[Path]:
+    return [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("packages/*/README.md")]
+
+
+def written_commands() -> Iterator[tuple[str, list[str]]]:
+    """Page and words of every command of the project in a code block, continued lines joined."""
+    for page in pages():
+        text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+        for line in re.findall(rf"^(?:    )?((?:{'|'.join(module('hooks').PROGRAMS)}) [a-z].*)$", text, re.MULTILINE):
+            yield page.relative_to(REPOSITORY).as_posix(), shlex.split(line, comments=True)
 
 
 def boxes(svg: str) -> list[tuple[str, float, float, float]]:
@@ -67,6 +84,44 @@ def test_bars_are_as_long_as_their_values():
     lengths = [width for _, _, _, width in boxes(svg)]
     assert lengths == [360, 180]
     assert [text.text for text in ElementTree.fromstring(svg).iter("text")] == ["one", "10 mm", "half", "5"]
+
+
+def test_options_of_written_commands_exist():
+    options = {
+        name: {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+        for program in module("hooks").PROGRAMS
+        for name, command in module("hooks").commands(program)
+    }
+    unknown = [
+        f"{page}: {' '.join(words[:2])} {word}"
+        for page, words in written_commands()
+        for word in words[2:]
+        if word.startswith("--") and word.split("=")[0] not in {*options[" ".join(words[:2])], "--help"}
+    ]
+    assert unknown == []
+
+
+def test_keys_of_written_commands_exist():
+    synthgen = importlib.import_module("synthgen.config")
+    scenes = keys(config_tools.to_dict(synthgen.SynthConfig()))
+    training = set(re.findall(r"^\| `([\w.]+)` \|", module("hooks").training_keys_page(), re.MULTILINE))
+    known = {"synthgen render": scenes, "synthgen bop": scenes, "refinenet train": training}
+    unknown = [
+        f"{page}: {value}"
+        for page, words in written_commands()
+        for option, value in pairwise(words)
+        if option == "--set" and "=" in value and not is_key(value.split("=")[0], known.get(" ".join(words[:2])))
+    ]
+    assert unknown == []
+
+
+def is_key(key: str, known: set[str] | None) -> bool:
+    return known is None or key.isupper() or key == "key" or key in known
+
+
+def keys(config: dict[str, Any], prefix: str = "") -> set[str]:
+    nested = [keys(value, f"{prefix}{name}.") for name, value in config.items() if isinstance(value, dict)]
+    return {f"{prefix}{name}" for name in config}.union(*nested)
 
 
 def test_every_training_key_is_documented():
