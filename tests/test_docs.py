@@ -156,10 +156,10 @@ def test_pages_load_nothing_from_elsewhere(site):
 
 
 def test_search_works_from_disk(site):
-    """Browsers refuse to fetch a JSON file from disk, so the index has to be a script that the page loads."""
-    index = (site / "search" / "search_index.js").read_text(encoding="utf-8")
-    assert "perturbation" in index
-    assert "search/search_index.js" in (site / "index.html").read_text(encoding="utf-8")
+    """Browsers fetch no JSON and start no worker from disk: the index is a script, workers run in frames."""
+    assert "perturbation" in (site / "search" / "search_index.js").read_text(encoding="utf-8")
+    assert 'src="../scripts/iframe-worker.js"' in (site / "experiments" / "lmo.html").read_text(encoding="utf-8")
+    assert (site / "scripts" / "iframe-worker.js").is_file()
 
 
 def test_drawings_and_generated_tables_are_in_the_pages(site):
