@@ -169,6 +169,6 @@ def test_drawings_and_generated_tables_are_in_the_pages(site):
 
 
 def test_pictures_are_small():
-    limits = {".gif": 1_500_000, ".mp4": 1_500_000, ".jpg": 400_000, ".png": 200_000}
+    limits = {".gif": 1_500_000, ".mp4": 1_500_000, ".jpg": 200_000, ".png": 200_000}
     for picture in (REPOSITORY / "docs" / "pictures").iterdir():
         assert picture.stat().st_size < limits[picture.suffix], picture.name

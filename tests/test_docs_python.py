@@ -14,6 +14,7 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "python.md"
+FILES = {"synthgen.json"}
 JOBS = {"RenderJob", "BopJob", "RefineJob", "TrackJob", "PerturbJob", "ReportJob"}
 
 
@@ -62,6 +63,28 @@ def test_functions_of_the_table_exist():
     for _, function, _ in rows:
         module, _, name = function.rpartition(".")
         assert callable(getattr(importlib.import_module(module), name))
+
+
+def test_dotted_names_of_all_pages_exist():
+    pages = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("packages/*/README.md")]
+    text = "\n".join(page.read_text(encoding="utf-8") for page in pages)
+    names = set(re.findall(r"`((?:posecore|synthgen|refinenet|evalkit)(?:\.[A-Za-z_]\w*)+)\b(?:\([^`]*\))?`", text))
+    assert len(names) > 20
+    assert sorted(name for name in names - FILES if not exists(name)) == []
+
+
+def exists(name: str) -> bool:
+    """Whether a dotted name is a module, or an attribute of one."""
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:length]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[length:]:
+            value = getattr(value, part, None)
+        return value is not None
+    return False
 
 
 def test_arguments_of_calls_exist():
