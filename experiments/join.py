@@ -19,7 +19,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 SAME = ("dataset", "split", "init", "perturbation", "settings")
-LISTS = ("start_lines", "failed_lines", "resets", "misses")
+LISTS = ("initial_lines", "failed_lines", "resets", "misses")
 
 
 def join(parts: list[Path], out: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from posecore import se3
-from posecore.bop import BopWriter, GroundTruth, ModelInfo, write_models, write_targets
+from posecore.bop import BopWriter, FrameRecord, GroundTruth, ModelInfo, write_models, write_targets
 from posecore.bop.writer import visible_targets
 from posecore.camera import Camera
 from posecore.mesh import Mesh
@@ -39,7 +39,12 @@ def write_rendered(root: Path, meshes: dict[int, Mesh], symmetric: int, images: 
             gts = [GroundTruth(obj_id=obj_id, T_cam_obj=T) for obj_id, T in poses.items()]
             visible = [layers.instance == index for index in range(len(gts))]
             with BopWriter(root, "test", scene_id) as writer:
-                writer.add_frame(im_id, layers.rgb, layers.depth_m, CAMERA, gts, masks, visible)
+                writer.add_frame(
+                    im_id,
+                    FrameRecord(
+                        rgb=layers.rgb, depth_m=layers.depth_m, camera=CAMERA, gts=gts, masks=masks, masks_visib=visible
+                    ),
+                )
     scenes = sorted({scene_id for scene_id, _ in images})
     write_targets(root, "test", [target for scene in scenes for target in visible_targets(root, "test", scene)])
     return root

@@ -235,15 +235,15 @@ def test_parts_join_into_one_result_file(tmp_path) -> None:
     lines = [Estimate(scene_id=1, im_id=im_id, obj_id=1 + im_id, T_cam_obj=here) for im_id in range(3)]
     parts = [tmp_path / "a_1.csv", tmp_path / "a_2.csv"]
     write_results(
-        parts[0], lines[:1], {"dataset": "toy", "start_lines": [2], "failed_lines": [3], "checkpoint_sha256": "x"}
+        parts[0], lines[:1], {"dataset": "toy", "initial_lines": [2], "failed_lines": [3], "checkpoint_sha256": "x"}
     )
-    write_results(parts[1], lines[1:], {"dataset": "toy", "start_lines": [4, 5], "failed_lines": []})
+    write_results(parts[1], lines[1:], {"dataset": "toy", "initial_lines": [4, 5], "failed_lines": []})
     join.join(parts, tmp_path / "a.csv")
     assert [line.obj_id for line in read_results(tmp_path / "a.csv")] == [1, 2, 3]
     sidecar = read_sidecar(tmp_path / "a.csv")
     assert sidecar is not None
     assert (sidecar["method"], sidecar["dataset"]) == ("a", "toy")
-    assert (sidecar["start_lines"], sidecar["failed_lines"]) == ([2, 4, 5], [3])
+    assert (sidecar["initial_lines"], sidecar["failed_lines"]) == ([2, 4, 5], [3])
     assert sidecar["parts"] == {"a_1.csv": "x", "a_2.csv": None}
 
 

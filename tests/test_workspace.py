@@ -38,8 +38,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
 TEST_TIME_ORACLES = {"timm"}
 ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
     "posecore": (
-        "errors se3 files config renamed processes numba_jit ply symmetry mesh simplify window camera contour raster "
-        "store shard bop html command_line"
+        "errors renamed se3 files config processes numba_jit ply symmetry mesh simplify window camera contour raster "
+        "store shard bop command_line"
     ),
     "synthgen": "scene engine machine config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (
@@ -85,7 +85,11 @@ def test_programs_never_import_each_other(package: str) -> None:
 
 
 def test_posecore_stands_on_its_own() -> None:
-    assert offences("posecore", {"torch", "bpy", "mathutils", "click", "rich", *PROGRAMS}) == []
+    assert offences("posecore", {"torch", "bpy", "mathutils", *PROGRAMS}) == []
+    with_extra = {"packages/posecore/src/posecore/command_line.py"}
+    assert {line.partition(":")[0] for line in offences("posecore", {"click", "rich"})} == with_extra
+    users = [file for file in sources("posecore") if "command_line" in file.read_text()]
+    assert users == []
 
 
 def test_blender_stays_in_one_folder() -> None:
@@ -139,7 +143,7 @@ def test_package_ships_licence_readme_and_the_common_version(package: str) -> No
     }
     assert versions == {project["version"]}
     own = [name for name in project["dependencies"] if name.startswith("posecore")]
-    assert own == ([] if package == "posecore" else [f"posecore=={project['version']}"])
+    assert own == ([] if package == "posecore" else [f"posecore[cli]=={project['version']}"])
 
 
 def module_name(file: Path, package: str) -> str:

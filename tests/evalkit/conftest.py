@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from posecore import se3
-from posecore.bop import BopDataset, BopWriter, Estimate, GroundTruth, ModelInfo, write_models
+from posecore.bop import BopDataset, BopWriter, Estimate, FrameRecord, GroundTruth, ModelInfo, write_models
 from posecore.camera import Camera
 from posecore.mesh import load_mesh
 from posecore.raster import Instance, Rasteriser
@@ -35,7 +35,12 @@ def write_dataset(root, meshes):
             gts = [GroundTruth(obj_id=obj_id, T_cam_obj=T) for obj_id, T in poses.items()]
             visible = [layers.instance == index for index in range(len(gts))]
             with BopWriter(root, "test", scene_id) as writer:
-                writer.add_frame(im_id, layers.rgb, layers.depth_m, CAMERA, gts, masks, visible)
+                writer.add_frame(
+                    im_id,
+                    FrameRecord(
+                        rgb=layers.rgb, depth_m=layers.depth_m, camera=CAMERA, gts=gts, masks=masks, masks_visib=visible
+                    ),
+                )
     return root
 
 

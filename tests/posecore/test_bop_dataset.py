@@ -9,10 +9,11 @@ import pytest
 from posecore import se3
 from posecore.bop import (
     BopDataset,
+    BopTarget,
     BopWriter,
+    FrameRecord,
     GroundTruth,
     ModelInfo,
-    Target,
     visible_targets,
     write_models,
     write_targets,
@@ -52,7 +53,9 @@ def write_frame(writer, im_id, *, focal=50.0, obj_id=2):
     depth_m = np.full((HEIGHT, WIDTH), 0.4567, np.float32)
     gts = [GroundTruth(obj_id=obj_id, T_cam_obj=pose(im_id))]
     full, visible = box_mask(5, 6, 10, 8), box_mask(5, 6, 5, 8)
-    writer.add_frame(im_id, rgb, depth_m, camera(focal), gts, [full], [visible])
+    writer.add_frame(
+        im_id, FrameRecord(rgb=rgb, depth_m=depth_m, camera=camera(focal), gts=gts, masks=[full], masks_visib=[visible])
+    )
     return rgb, gts[0]
 
 
@@ -69,7 +72,7 @@ def dataset_path(tmp_path, bobbin_ply):
 def test_written_dataset_reads_back(dataset_path, bobbin_ply):
     dataset = BopDataset(dataset_path)
     assert (dataset.name, dataset.split, dataset.scene_ids, dataset.obj_ids) == ("things", "test", [3, 11], [2])
-    assert dataset.targets == [Target(scene_id=3, im_id=0, obj_id=2), Target(scene_id=11, im_id=7, obj_id=2)]
+    assert dataset.targets == [BopTarget(scene_id=3, im_id=0, obj_id=2), BopTarget(scene_id=11, im_id=7, obj_id=2)]
     assert np.allclose(dataset.camera(11, 7).K, camera(57.0).K)
     assert (dataset.camera(3, 0).width_px, dataset.camera(3, 0).height_px) == (WIDTH, HEIGHT)
     (truth,) = dataset.gt(11, 7)
@@ -126,7 +129,18 @@ def test_box_reaches_outside_the_image(tmp_path):
     rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     gts = [GroundTruth(obj_id=1, T_cam_obj=pose(1))]
     inside = canvas[20 : 20 + HEIGHT, 20 : 20 + WIDTH]
-    writer.add_frame(0, rgb, None, camera(), gts, [canvas], [inside], mask_origin_px=(20, 20))
+    writer.add_frame(
+        0,
+        FrameRecord(
+            rgb=rgb,
+            depth_m=None,
+            camera=camera(),
+            gts=gts,
+            masks=[canvas],
+            masks_visib=[inside],
+            mask_origin_px=(20, 20),
+        ),
+    )
     writer.close()
     entry = json.loads((tmp_path / "test/000001/scene_gt_info.json").read_text())["0"][0]
     assert entry["bbox_obj"] == [-10, 0, 24, 4]
@@ -169,7 +183,10 @@ def test_what_is_written_for_a_frame_does_not_grow_with_the_scene(tmp_path):
     with BopWriter(tmp_path, "test", 1) as writer:
         for im_id in range(40):
             truth = GroundTruth(obj_id=1, T_cam_obj=pose(1))
-            writer.add_frame(im_id, rgb, None, camera(), [truth], [mask], [mask])
+            writer.add_frame(
+                im_id,
+                FrameRecord(rgb=rgb, depth_m=None, camera=camera(), gts=[truth], masks=[mask], masks_visib=[mask]),
+            )
             sizes.append((tmp_path / "test/000001/.frames.jsonl").stat().st_size)
             assert not (tmp_path / "test/000001/scene_gt.json").exists()
     assert max(np.diff(sizes)) <= min(np.diff(sizes)) + 1
@@ -181,10 +198,14 @@ def test_targets_count_instances_that_are_visible_enough(tmp_path):
     parts = [box_mask(0, 0, 10, 1), box_mask(0, 0, 9, 1), full, box_mask(0, 0, 0, 0)]
     gts = [GroundTruth(obj_id=i, T_cam_obj=pose(i)) for i in (2, 2, 2, 7)]
     with BopWriter(tmp_path, "test", 4) as writer:
-        writer.add_frame(3, rgb, None, camera(), gts, [full] * 4, parts)
-        writer.add_frame(9, rgb, None, camera(), gts[:1], [full], parts[3:])
+        writer.add_frame(
+            3, FrameRecord(rgb=rgb, depth_m=None, camera=camera(), gts=gts, masks=[full] * 4, masks_visib=parts)
+        )
+        writer.add_frame(
+            9, FrameRecord(rgb=rgb, depth_m=None, camera=camera(), gts=gts[:1], masks=[full], masks_visib=parts[3:])
+        )
     targets = visible_targets(tmp_path, "test", 4)
-    assert targets == [Target(scene_id=4, im_id=3, obj_id=2, inst_count=2)]
+    assert targets == [BopTarget(scene_id=4, im_id=3, obj_id=2, inst_count=2)]
     write_targets(tmp_path, "test", targets)
     assert json.loads((tmp_path / "test_targets_bop24.json").read_text()) == [{"im_id": 3, "scene_id": 4}]
 
@@ -192,7 +213,10 @@ def test_targets_count_instances_that_are_visible_enough(tmp_path):
 def test_the_world_pose_is_bops(tmp_path):
     rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     with BopWriter(tmp_path, "test", 1) as writer:
-        writer.add_frame(0, rgb, None, camera(), [], [], [], T_cam_world=pose(3))
+        writer.add_frame(
+            0,
+            FrameRecord(rgb=rgb, depth_m=None, camera=camera(), gts=[], masks=[], masks_visib=[], T_cam_world=pose(3)),
+        )
     entry = json.loads((tmp_path / "test/000001/scene_camera.json").read_text())["0"]
     assert np.allclose(np.reshape(entry["cam_R_w2c"], (3, 3)), pose(3)[:3, :3])
     assert np.allclose(np.array(entry["cam_t_w2c"]) / 1000, pose(3)[:3, 3])
@@ -219,7 +243,10 @@ def test_writer_refuses_what_does_not_fit(tmp_path, broken):
     gts = [GroundTruth(obj_id=1, T_cam_obj=pose(1))]
     masks = [] if broken == "masks" else [box_mask(1, 1, 2, 2)]
     with pytest.raises(DatasetError):
-        writer.add_frame(0, rgb, depth_m, cam, gts, masks, [box_mask(1, 1, 2, 2)])
+        writer.add_frame(
+            0,
+            FrameRecord(rgb=rgb, depth_m=depth_m, camera=cam, gts=gts, masks=masks, masks_visib=[box_mask(1, 1, 2, 2)]),
+        )
     assert not (tmp_path / "test/000001/scene_gt.json").exists()
 
 
@@ -227,7 +254,9 @@ def test_no_pose_marker(dataset_path):
     with BopWriter(dataset_path, "test", 3) as writer:
         nowhere = GroundTruth(obj_id=2, T_cam_obj=np.full((4, 4), np.nan), has_pose=False)
         rgb, mask = np.zeros((HEIGHT, WIDTH, 3), np.uint8), box_mask(0, 0, 1, 1)
-        writer.add_frame(9, rgb, None, camera(), [nowhere], [mask], [mask])
+        writer.add_frame(
+            9, FrameRecord(rgb=rgb, depth_m=None, camera=camera(), gts=[nowhere], masks=[mask], masks_visib=[mask])
+        )
     entry = json.loads((dataset_path / "test/000003/scene_gt.json").read_text())["9"][0]
     assert entry["cam_t_m2c"] == [-1, -1, -1]
     dataset = BopDataset(dataset_path)
@@ -290,9 +319,9 @@ def test_size_from_camera_json_without_images(dataset_path):
 
 def test_targets_files(dataset_path):
     (dataset_path / "test_targets_bop24.json").write_text('[{"im_id": 7, "scene_id": 11}]')
-    assert BopDataset(dataset_path).targets == [Target(scene_id=11, im_id=7, obj_id=2)]
-    write_targets(dataset_path, "test", [Target(scene_id=3, im_id=0, obj_id=2, inst_count=4)])
-    assert BopDataset(dataset_path).targets == [Target(scene_id=3, im_id=0, obj_id=2, inst_count=4)]
+    assert BopDataset(dataset_path).targets == [BopTarget(scene_id=11, im_id=7, obj_id=2)]
+    write_targets(dataset_path, "test", [BopTarget(scene_id=3, im_id=0, obj_id=2, inst_count=4)])
+    assert BopDataset(dataset_path).targets == [BopTarget(scene_id=3, im_id=0, obj_id=2, inst_count=4)]
 
 
 def test_models_eval_is_preferred_for_errors(dataset_path, tug_ply):
@@ -385,6 +414,6 @@ def test_broken_models_info(dataset_path, content, message):
 
 
 def test_targets_of_a_missing_scene(dataset_path):
-    write_targets(dataset_path, "test", [Target(scene_id=99, im_id=0, obj_id=2)])
+    write_targets(dataset_path, "test", [BopTarget(scene_id=99, im_id=0, obj_id=2)])
     with pytest.raises(DatasetError, match="entry 0: scene 99 is not in"):
         _ = BopDataset(dataset_path).targets

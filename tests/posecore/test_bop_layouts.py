@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from bop_folders import CAMERA, name_sensor, write_rendered
-from posecore.bop import BopDataset, Target
+from posecore.bop import BopDataset, BopTarget
 from posecore.errors import DatasetError
 from posecore.mesh import load_mesh
 
@@ -48,12 +48,12 @@ def test_a_single_named_sensor_needs_no_choice(root):
     dataset = BopDataset(root)
     assert dataset.sensors == ("photoneo",)
     assert dataset.scene_ids == [3, 11]
-    assert dataset.image_path(3, 4) == root / "test/000003/rgb_photoneo/000004.png"
+    assert dataset.image_file(3, 4).path == root / "test/000003/rgb_photoneo/000004.png"
     assert dataset.depth_m(3, 4).max() > 0.4
     assert dataset.mask(3, 4, 1, visible=True).sum() > 50
     assert dataset.gt(3, 4)[0].visib_fract == pytest.approx(1.0)
     assert dataset.camera_file == root / "camera_photoneo.json"
-    assert dataset.targets[0] == Target(scene_id=3, im_id=0, obj_id=1)
+    assert dataset.targets[0] == BopTarget(scene_id=3, im_id=0, obj_id=1)
 
 
 def test_several_sensors_are_listed_until_one_is_named(root):
@@ -67,7 +67,7 @@ def test_several_sensors_are_listed_until_one_is_named(root):
             shutil.copy(path, second / path.name.replace("cam1", "cam2"))
     change(second / "scene_camera_cam2.json", lambda c: c["4"]["cam_K"].__setitem__(0, 200.0))
     with pytest.raises(
-        DatasetError, match=r"several sensors \(cam1 in 2 scene\(s\), cam2 in 1 scene\(s\)\); say which"
+        DatasetError, match=r"several sensors \(cam1 in 2 scene\(s\), cam2 in 1 scene\(s\)\); choose one"
     ):
         BopDataset(root)
     with pytest.raises(DatasetError, match=r"no sensor 'cam3'; there are cam1 in 2"):
@@ -94,8 +94,8 @@ def test_scenes_of_different_sensors_take_the_first_they_have(root):
         BopDataset(root)
     dataset = BopDataset(root, sensor="rgb,gray1")
     assert dataset.scene_ids == [3, 11]
-    assert dataset.image_path(3, 0).parent.name == "rgb"
-    assert dataset.image_path(11, 7).parent.name == "gray1"
+    assert dataset.image_file(3, 0).path.parent.name == "rgb"
+    assert dataset.image_file(11, 7).path.parent.name == "gray1"
     assert dataset.rgb(11, 7).shape == (CAMERA.height_px, CAMERA.width_px, 3)
     assert len(dataset.gt(11, 7)) == 2
 
@@ -122,7 +122,7 @@ def test_the_split_is_found_by_its_name(root, made, chosen):
 def test_two_splits_of_one_kind_are_listed(root):
     shutil.copytree(root / "test", root / "test_kinect")
     (root / "test").rename(root / "test_primesense")
-    with pytest.raises(DatasetError, match=r"several splits \(test_kinect, test_primesense\); say which one"):
+    with pytest.raises(DatasetError, match=r"several splits \(test_kinect, test_primesense\); choose one"):
         BopDataset(root)
     assert BopDataset(root, "test_kinect").scene_ids == [3, 11]
 
@@ -227,8 +227,8 @@ def test_two_folders_of_one_scene_are_refused(root):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('{"4": [], "4": []}', "the key '4' stands twice"),
-        ('{"4": [], "004": []}', "two keys mean 4, one of them '004'"),
+        ('{"4": [], "4": []}', "the key '4' occurs twice"),
+        ('{"4": [], "004": []}', "two keys mean 4, such as '004'"),
         ('{"-4": []}', "a key is not an integer \\('-4'\\)"),
         ('{"4": ' + "[" * 100_000, "nested too deep"),
         ('{"4": ' + "9" * 5000 + "}", "a number has thousands of digits"),

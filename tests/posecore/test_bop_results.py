@@ -11,11 +11,11 @@ from posecore.bop import (
     BopDataset,
     Estimate,
     ResultTable,
+    estimate_table,
     read_result_table,
     read_results,
     read_sidecar,
     sidecar_path,
-    table_of,
     write_results,
 )
 from posecore.bop.result_table import COLUMNS, parse_results
@@ -35,7 +35,7 @@ def estimate(seed, **changes):
 def test_round_trip_keeps_nine_decimals(tmp_path):
     path = tmp_path / "r.csv"
     estimates = [estimate(seed) for seed in range(5)]
-    write_results(path, estimates, {"dataset": "things", "method": "start"})
+    write_results(path, estimates, {"dataset": "things", "method": "initial"})
     back = read_results(path)
     assert [(e.scene_id, e.im_id, e.obj_id, e.score, e.time_s) for e in back] == [
         (e.scene_id, e.im_id, e.obj_id, e.score, e.time_s) for e in estimates
@@ -44,7 +44,7 @@ def test_round_trip_keeps_nine_decimals(tmp_path):
     for before, after in zip(estimates, back, strict=True):
         assert np.abs(before.T_cam_obj - after.T_cam_obj).max() < 1e-9
     assert path.read_text().splitlines()[0] == HEADER
-    assert read_sidecar(path) == {"dataset": "things", "method": "start"}
+    assert read_sidecar(path) == {"dataset": "things", "method": "initial"}
     assert sidecar_path(path) == tmp_path / "r.csv.json"
 
 
@@ -95,7 +95,7 @@ def test_broken_lines_are_named(tmp_path, line, message):
 def test_metres_are_suspected(tmp_path):
     path = tmp_path / "r.csv"
     path.write_text(f"{HEADER}\n1,2,3,0.5,1 0 0 0 1 0 0 0 1,0.01 0.02 0.9,-1\n")
-    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, which looks like metres"):
+    with pytest.raises(ResultFileError, match=r"r.csv:2: the median t_z of the file is 0.9, probably in metres"):
         read_results(path)
 
 
@@ -282,7 +282,7 @@ def test_all_faults_are_told_and_the_good_lines_kept():
 
 
 def test_a_table_is_cut_and_joined():
-    table = table_of([estimate(seed) for seed in range(4)])
+    table = estimate_table([estimate(seed) for seed in range(4)])
     both = ResultTable.concat([table.take(np.array([3])), table.take(table.im_id < 2)])
     assert both.im_id.tolist() == [3, 0, 1]
     assert np.array_equal(both.T_cam_obj[0], estimate(3).T_cam_obj)

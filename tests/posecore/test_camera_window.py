@@ -94,3 +94,22 @@ def test_windows_are_centred_on_the_hypothesis() -> None:
 def test_camera_refuses_what_is_no_pinhole(matrix: np.ndarray, size: tuple[int, int]) -> None:
     with pytest.raises(CameraError, match="found"):
         camera.Camera(K=matrix, width_px=size[0], height_px=size[1])
+
+
+def test_pixels_inside_are_those_whose_centres_lie_in_the_image() -> None:
+    inside = window.pixels_inside(window.Window(x0_px=-2.0, y0_px=6.0, side_px=8.0), 4, 4, 12)
+    np.testing.assert_array_equal(inside, np.outer([True, True, True, False], [False, True, True, False]))
+    assert not window.pixels_inside(window.Window(x0_px=12.0, y0_px=0.0, side_px=8.0), 4, 12, 12).any()
+
+
+@pytest.mark.parametrize("side_px", [24.0, 96.0])
+def test_a_replicated_border_is_as_if_the_image_went_on(side_px: float) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (40, 50, 3), dtype=np.uint8)
+    padded = np.pad(image, ((256, 256), (256, 256), (0, 0)), mode="edge")
+    for x0_px, y0_px in ((-20.5, -3.25), (30.0, 25.75), (10.0, 10.0), (-60.0, 90.0)):
+        w = window.Window(x0_px=x0_px, y0_px=y0_px, side_px=side_px)
+        moved = window.Window(x0_px=x0_px + 256, y0_px=y0_px + 256, side_px=side_px)
+        expected = window.cut(padded, moved, 32, interpolation="area")
+        np.testing.assert_array_equal(window.cut_rgb(image, w, 32, border="replicate"), expected)
+    outside = window.cut_rgb(image, window.Window(x0_px=-200.0, y0_px=0.0, side_px=24.0), 32)
+    assert not outside.any()

@@ -4,10 +4,11 @@ import os
 import stat
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import pytest
 from posecore import config, files
+from posecore.config import Range, check_ranges
 from posecore.errors import ConfigError, MeshError, StorageError, exit_code
 
 
@@ -54,6 +55,84 @@ def test_wrong_keys_and_values_are_named(mapping: dict[str, object], message: st
     with pytest.raises(ConfigError, match=message) as caught:
         config.build(Setup, mapping, "x.yaml")
     assert exit_code(caught.value) == 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ranged:
+    n: Annotated[int, Range(1)] = 1
+    fraction: Annotated[float, Range(0, 1)] = 0.5
+    angle_deg: Annotated[float, Range(0, 180, above=True)] = 90.0
+    decay: Annotated[float, Range(0, 1, under=True)] = 0.0
+    scale: Annotated[float, Range(1, 5, unit="diameters")] | None = None
+    shift: Annotated[float, Range(high=3)] = 0.0
+    pair: Annotated[tuple[float, float], Range(-1, 1)] = (0.0, 0.5)
+    maybe: Annotated[tuple[float, float] | None, Range(0, 1)] = None
+    widths: tuple[Annotated[int, Range(1, unit="channels")], ...] = (1,)
+    light: Light = field(default_factory=Light)
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"n": 0}, "n is 0, expected 1 or more"),
+        ({"fraction": 1.5}, "fraction is 1.5, expected 0 to 1"),
+        ({"fraction": float("nan")}, "fraction is nan, expected 0 to 1"),
+        ({"shift": -float("inf")}, "shift is -inf, expected 3 or less"),
+        ({"angle_deg": 0.0}, "angle_deg is 0.0, expected above 0 to 180"),
+        ({"decay": 1.0}, "decay is 1.0, expected 0 to under 1"),
+        ({"scale": 7.0}, "scale is 7.0, expected 1 to 5 diameters"),
+        ({"pair": (0.5, 0.0)}, "pair is [0.5, 0.0], expected low <= high within -1 to 1"),
+        ({"pair": (-2.0, 0.0)}, "pair is [-2.0, 0.0], expected low <= high within -1 to 1"),
+        ({"maybe": (0.0, 1.5)}, "maybe is [0.0, 1.5], expected low <= high within 0 to 1"),
+        ({"widths": (3, 0)}, "widths[1] is 0, expected 1 or more channels"),
+    ],
+)
+def test_ranges_hold_for_files_and_for_code(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Ranged(**values)
+    assert str(caught.value) == message
+    with pytest.raises(ConfigError) as caught:
+        config.build(Ranged, values, "x.yaml")
+    assert str(caught.value) == f"x.yaml: {message}"
+
+
+def test_values_at_the_ends_of_their_ranges_are_fine() -> None:
+    made = config.build(Ranged, {"fraction": 1, "angle_deg": 180, "scale": 5, "pair": [1, 1], "maybe": [0, 0]}, "x")
+    assert (made.fraction, made.scale, made.pair, made.maybe) == (1.0, 5.0, (1.0, 1.0), (0.0, 0.0))
+
+
+def test_build_checks_ranges_of_a_class_that_does_not() -> None:
+    @dataclass(frozen=True, kw_only=True)
+    class Careless:
+        n: Annotated[int, Range(1)]
+
+    assert Careless(n=0).n == 0
+    with pytest.raises(ConfigError, match=r"x\.yaml: n is 0, expected 1 or more"):
+        config.build(Careless, {"n": 0}, "x.yaml")
+
+
+@pytest.mark.parametrize(
+    ("mapping", "message"),
+    [
+        ({"light": {"watts": 2}}, "x.yaml: light.watts is now light.power_w"),
+        ({"count": 2}, "x.yaml: count is now n"),
+        ({"n": 1, "kind": "old"}, "x.yaml: kind=old is now kind=b"),
+        ({"n": 1, "lamp": {"rgb": [1, 1, 1]}}, "x.yaml: lamp is now light"),
+        ({"n": 1, "lamp": {"watts": 1}}, "x.yaml: lamp.watts is now light.power_w"),
+    ],
+)
+def test_renamed_keys_are_refused_with_their_new_name(mapping: dict[str, object], message: str) -> None:
+    renamed = {
+        "lamp": "light", "count": "n", "light.watts": "light.power_w", "lamp.watts": "light.power_w",
+        "kind=old": "kind=b",
+    }  # fmt: skip
+    with pytest.raises(ConfigError) as caught:
+        config.build(Setup, mapping, "x.yaml", renamed)
+    assert str(caught.value) == message
+    assert config.build(Setup, {"n": 1, "kind": "b", "light": {"power_w": 1}}, "x.yaml", renamed).kind == "b"
 
 
 def test_overrides_are_read_as_yaml() -> None:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from posecore import se3
 from posecore.errors import MeshError
 from posecore.mesh import Mesh, diameter, load_mesh, save_ply
 
@@ -191,3 +192,13 @@ def test_a_missing_gltf_texture_is_an_error_not_grey(shared_data: Path, tmp_path
     (tmp_path / "bowl.gltf").write_text(json.dumps(content))
     with pytest.raises(MeshError, match=r"texture .*a skin.png is missing"):
         load_mesh(tmp_path / "bowl.gltf", units="m")
+
+
+def test_the_box_centre_in_the_camera_is_that_of_each_pose(tmp_path: Path) -> None:
+    cube = load_mesh(write_box(tmp_path / "box.ply"))
+    rng = np.random.default_rng(0)
+    T = np.stack([se3.make_T(se3.random_rotation(rng), rng.normal(size=3)) for _ in range(6)]).reshape(2, 3, 4, 4)
+    found = cube.center_cam_m(T)
+    assert found.shape == (2, 3, 3)
+    np.testing.assert_allclose(found, se3.apply(T, cube.center_m[None])[..., 0, :], atol=1e-12)
+    np.testing.assert_array_equal(cube.center_cam_m(T[1, 2]), T[1, 2, :3, :3] @ cube.center_m + T[1, 2, :3, 3])

@@ -7,7 +7,7 @@ import time
 
 import pytest
 from posecore.errors import RenderError
-from posecore.processes import behave_as_worker, in_order, spawned
+from posecore.processes import behave_as_worker, in_order, map_unordered, spawned, unordered
 
 
 def test_results_come_in_order_and_few_ahead():
@@ -53,6 +53,65 @@ def test_nor_for_the_rest_of_a_result_that_is_being_sent(seconds):
     assert (ended.returncode, ended.stderr) == (3, "")
 
 
-def test_a_process_that_dies_is_said():
+def test_a_process_that_dies_is_reported():
     with pytest.raises(RenderError, match=r"^it died$"), spawned(1, behave_as_worker, (), "it died") as pool:
         pool.submit(os._exit, 1).result()
+
+
+def doubled_later(seconds):
+    time.sleep(seconds)
+    return 2 * seconds
+
+
+def test_results_come_as_they_finish_each_with_its_task():
+    with spawned(2, behave_as_worker, (), "died") as pool:
+        assert list(unordered(pool, abs, [], ahead=3)) == []
+        results = list(unordered(pool, doubled_later, (1.0, 0.0, 0.01), ahead=3))
+    assert results[-1] == (1.0, 2.0)
+    assert sorted(results) == [(0.0, 0.0), (0.01, 0.02), (1.0, 2.0)]
+
+
+def test_items_are_taken_as_processes_become_free():
+    taken = []
+    results = map_unordered(abs, (taken.append(i) or -i for i in range(9)), 1, died=str, ahead=2)
+    assert next(results) == (0, 0)
+    assert taken == [0, 1]
+    results.close()
+    assert sorted(map_unordered(abs, range(-9, 0), 2, died=str)) == [(-i, i) for i in range(9, 0, -1)]
+
+
+def touch_then_die(path):
+    if path.name == "deadly" or (path.name == "once" and not path.exists()):
+        path.touch()
+        os._exit(1)
+    return path.name
+
+
+def test_processes_that_die_are_replaced_and_their_items_done_again(tmp_path):
+    crashes = []
+    items = [tmp_path / name for name in ("a", "once", "b", "c")]
+    results = map_unordered(
+        touch_then_die, items, 2, died=str, attempts=3, on_crash=lambda: crashes.append((tmp_path / "once").exists())
+    )
+    assert sorted(results) == [(item, item.name) for item in sorted(items)]
+    assert crashes == [True]
+
+
+def test_items_that_kill_every_process_end_the_run(tmp_path):
+    crashes = []
+    results = map_unordered(
+        touch_then_die,
+        [tmp_path / "deadly", tmp_path / "a"],
+        1,
+        died=lambda path: f"died at {path.name}",
+        attempts=3,
+        on_crash=lambda: crashes.append(1),
+    )
+    with pytest.raises(RenderError, match=r"^died at deadly$"):
+        list(results)
+    assert len(crashes) == 3
+
+
+def test_an_error_of_the_job_is_raised_itself():
+    with pytest.raises(TypeError, match="has no len"):
+        list(map_unordered(len, ("ab", 5), 1, died=str, attempts=3))

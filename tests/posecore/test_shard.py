@@ -241,3 +241,11 @@ def test_a_flipped_bit_is_found_when_few_fields_are_read(tmp_path: Path) -> None
     with pytest.raises(ShardError, match=r"scene_mask/c/1/0/0: does not decode \(checksum differs\).*shard is damaged"):
         shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_mask"])
     shard.ShardReader(str(tmp_path / "d")).read(1, ["scene_rgb"])
+
+
+def test_manifest_lines_by_shard(tmp_path: Path) -> None:
+    write(str(tmp_path / "d"), (2, 0))
+    reader = shard.ShardReader(str(tmp_path / "d"))
+    stored = [json.loads(line) for line in (tmp_path / "d" / shard.MANIFEST).read_text().splitlines()]
+    assert list(reader.manifest_lines) == [0, 2]
+    assert list(reader.manifest_lines.values()) == sorted(stored, key=lambda line: line["shard"])

@@ -12,7 +12,7 @@ import pytest
 import torch
 import trimesh
 from posecore import contour, se3
-from posecore.bop import BopWriter, Estimate, GroundTruth, write_models, write_results
+from posecore.bop import BopWriter, Estimate, FrameRecord, GroundTruth, write_models, write_results
 from posecore.bop.models_info import save_models_info
 from posecore.camera import Camera, crop_K, intrinsics
 from posecore.mesh import Mesh, load_mesh, save_ply
@@ -186,7 +186,17 @@ def make_bop(root, image, camera, truths, mesh):
         layers = rasteriser.render(1, camera.K, truths, camera.width_px, camera.height_px)
     gts = [GroundTruth(obj_id=1, T_cam_obj=T, visib_fract=1.0, gt_index=i) for i, T in enumerate(truths)]
     writer = BopWriter(root, "test", 1)
-    writer.add_frame(0, image, layers.depth_m.max(axis=0), camera, gts, list(layers.mask), list(layers.mask))
+    writer.add_frame(
+        0,
+        FrameRecord(
+            rgb=image,
+            depth_m=layers.depth_m.max(axis=0),
+            camera=camera,
+            gts=gts,
+            masks=list(layers.mask),
+            masks_visib=list(layers.mask),
+        ),
+    )
     writer.close()
     write_models(root, {1: mesh}, {})
 
@@ -200,7 +210,7 @@ def bop(tmp_path, mesh, frame):
     make_bop(root, image, camera, truths, mesh)
     starts = [*starts_of(truths, mesh), se3.make_T(np.eye(3), np.array([0, 0, -0.5]))]
     estimates = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=T) for T in starts]
-    sidecar = {"dataset": str(root), "method": "start", "perturbation": {"rows": [{"line": 2}]}}
+    sidecar = {"dataset": str(root), "method": "initial", "perturbation": {"rows": [{"line": 2}]}}
     write_results(tmp_path / "start.csv", estimates, sidecar)
     return root, tmp_path / "start.csv"
 

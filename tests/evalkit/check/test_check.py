@@ -194,7 +194,7 @@ def empty_scene(root):
 DATASET_FAULTS = {
     "json": (write(GT, '{"0": [\n {,'), "error", "json", r"scene_gt.json:2:3: invalid JSON"),
     "json shape": (write(GT, "[]"), "error", "json", "found a list at the top, expected a dict"),
-    "key twice": (write(GT, '{"4": [], "4": []}'), "error", "json", "the key '4' stands twice"),
+    "key twice": (write(GT, '{"4": [], "4": []}'), "error", "json", "the key '4' occurs twice"),
     "no list": (
         lambda r: change(r, GT, lambda c: c | {"4": {}}),
         "error",

@@ -329,15 +329,15 @@ def test_meshes_with_any_bytes(tmp_path, original, change):
 @pytest.mark.parametrize(
     ("before", "after", "said"),
     [
-        (b"3 1 7 3\n", b"", "has 11 rows of 'face', its header says 12; the file is cut off"),
+        (b"3 1 7 3\n", b"", "has 11 rows of 'face', its header gives 12; the file is cut off"),
         (b"\n30 20 15\n", b"\n30 20 1S\n", "the vertex is '30 20 1S', expected numbers"),
         (b"\n30 20 15\n", b"\n30 20-15\n", "the vertex is '30 20-15', expected numbers"),
-        (b"\n30 20 15\n", b"\n30 20 15 9\n", "the vertex has 4 numbers, its header says 3"),
-        (b"\n30 20 15\n", b"\n\n30 20 15\n", "the vertex has 0 numbers, its header says 3"),
+        (b"\n30 20 15\n", b"\n30 20 15 9\n", "the vertex has 4 numbers, its header gives 3"),
+        (b"\n30 20 15\n", b"\n\n30 20 15\n", "the vertex has 0 numbers, its header gives 3"),
         (b"3 1 7 3\n", b"3 1 7.9 3\n", "names a vertex by something that is no whole number"),
-        (b"3 1 7 3\n", b"2 1 7 3\n", "the face has 4 numbers, its header says 3"),
+        (b"3 1 7 3\n", b"2 1 7 3\n", "the face has 4 numbers, its header gives 3"),
         pytest.param(b"3 1 7 3\n", b"9" * 5000 + b" 1 7 3\n", "has no count of its list", id="endless count"),
-        pytest.param(ascii_ply()[-120:], b"", "of 'vertex', its header says 8; the file is cut off", id="cut"),
+        pytest.param(ascii_ply()[-120:], b"", "of 'vertex', its header gives 8; the file is cut off", id="cut"),
     ],
 )
 def test_an_ascii_mesh_that_a_lenient_reader_would_take_is_refused(tmp_path, before, after, said):
@@ -510,6 +510,6 @@ def test_report_survives_anything_in_json(root, sound, tmp_path, name, which, ne
 def test_report_survives_any_result_file_and_sidecar(root, sound, tmp_path, change, sidecar):
     file = tmp_path / "poses_cubes-test.csv"
     file.write_bytes(change((sound.parent / "poses_cubes-test.csv").read_bytes()))
-    content = {"dataset": str(root), "method": "x", "perturbation": sidecar, "start_lines": sidecar}
+    content = {"dataset": str(root), "method": "x", "perturbation": sidecar, "initial_lines": sidecar}
     Path(f"{file}.json").write_text(json.dumps(content))
     reported(root, file, tmp_path / "report")

@@ -346,7 +346,7 @@ def test_result_files_are_evaluated_and_shown(results, tmp_path):
 
 def test_the_order_of_the_files_is_kept_also_where_the_second_holds_start_poses(dataset, perfect, tmp_path):
     write_results(tmp_path / "refined.csv", perfect, {"dataset": str(dataset.root)})
-    write_results(tmp_path / "start.csv", perfect[:-1], {"dataset": str(dataset.root), "method": "start"})
+    write_results(tmp_path / "start.csv", perfect[:-1], {"dataset": str(dataset.root), "method": "initial"})
     with open_sides((tmp_path / "refined.csv", tmp_path / "start.csv")) as both:
         assert (both.a.name, both.b.name) == ("refined", "start")
 

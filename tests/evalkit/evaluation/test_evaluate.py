@@ -22,7 +22,7 @@ from evalkit.report.summary import start_of
 from evalkit.scores import by_object, scores
 from evalkit.scores.convergence import by_level
 from posecore import se3
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target, symmetry_transforms, write_results, write_targets
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth, symmetry_transforms, write_results, write_targets
 from posecore.errors import DatasetError, RenderError, ResultFileError
 
 from ..conftest import BOBBIN, CAMERA, IMAGES, TUG
@@ -148,7 +148,7 @@ def test_instances_take_the_nearest_free_truth(dataset_path, tmp_path):
     content["0"].append(second)
     file.write_text(json.dumps(content))
     (root / "test/000004/scene_gt_info.json").unlink()
-    write_targets(root, "test", [Target(scene_id=4, im_id=0, obj_id=TUG, inst_count=2)])
+    write_targets(root, "test", [BopTarget(scene_id=4, im_id=0, obj_id=TUG, inst_count=2)])
     dataset = BopDataset(root)
     first, third = (gt for gt in dataset.gt(4, 0) if gt.obj_id == TUG)
     estimates = [
@@ -164,7 +164,7 @@ def test_instances_take_the_nearest_free_truth(dataset_path, tmp_path):
 def test_target_without_truth_is_an_error(dataset_path, tmp_path, perfect):
     root = tmp_path / "toys"
     shutil.copytree(dataset_path, root)
-    write_targets(root, "test", [Target(scene_id=4, im_id=0, obj_id=3)])
+    write_targets(root, "test", [BopTarget(scene_id=4, im_id=0, obj_id=3)])
     with pytest.raises(DatasetError, match=r"scene_gt.json: image 0 has no pose of object 3"):
         pair_up(BopDataset(root), in_memory(perfect))
 
@@ -245,7 +245,7 @@ def test_levels_pair_by_start_line_and_by_order(dataset, perfect):
     block = {"perturbation": {"rows": rows}}
     in_order = pair_up(dataset, in_memory([truth] * 3, block)).pairs
     assert [pair.level.angle_deg for pair in in_order] == [5.0, 10.0, 20.0]
-    two = pair_up(dataset, in_memory([truth] * 2, block | {"start_lines": [4, 2]})).pairs
+    two = pair_up(dataset, in_memory([truth] * 2, block | {"initial_lines": [4, 2]})).pairs
     assert [pair.estimate is None for pair in two] == [False, True, False]
     with pytest.raises(ResultFileError, match="2 estimates of object 1 in scene 4, image 0, but 3 starts"):
         pair_up(dataset, in_memory([truth] * 2, block))

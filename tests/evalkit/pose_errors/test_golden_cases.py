@@ -14,6 +14,7 @@ from posecore.bop import (
     BopDataset,
     BopWriter,
     Estimate,
+    FrameRecord,
     GroundTruth,
     ModelInfo,
     symmetry_transforms,
@@ -147,7 +148,17 @@ def plates(tmp_path_factory):
     depth_m[:, :100] = 0.5  # something stands before the plate's left half
     visible = mask & (np.arange(200) >= 100)
     with BopWriter(root, "test", 1) as writer:
-        writer.add_frame(0, rgb, depth_m, PLATE_CAMERA, [GroundTruth(obj_id=PLATE, T_cam_obj=T)], [mask], [visible])
+        writer.add_frame(
+            0,
+            FrameRecord(
+                rgb=rgb,
+                depth_m=depth_m,
+                camera=PLATE_CAMERA,
+                gts=[GroundTruth(obj_id=PLATE, T_cam_obj=T)],
+                masks=[mask],
+                masks_visib=[visible],
+            ),
+        )
     return BopDataset(root)
 
 

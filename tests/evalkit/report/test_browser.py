@@ -36,7 +36,7 @@ def pages(tmp_path_factory, dataset_path):
         half = se3.rotation_from_rotvec(se3.rotvec_from_rotation(dR) / 2)
         better.append(replace(start, T_cam_obj=se3.apply_update(start.T_cam_obj, half, dt / 2)))
     lines = [start.line for start in read_results(starts)]
-    sidecar = {"method": "half", "init": "start.csv", "start_lines": lines}
+    sidecar = {"method": "half", "init": "start.csv", "initial_lines": lines}
     write_results(work / "half.csv", better, sidecar)
     named = ("--dataset", work / "toys")
     run("report", *named, "--results", starts, "--results", work / "half.csv", "--out", work / "report")

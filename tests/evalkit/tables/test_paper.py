@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from evalkit.cli import main
-from evalkit.cli.group import CleanGroup
 from evalkit.cli.tables import tables
 from posecore import se3
 from posecore.bop import BopDataset, read_results, read_sidecar, write_results
+from posecore.command_line import ErrorReportingGroup
 
-GROUP = CleanGroup(commands={"tables": tables})
+GROUP = ErrorReportingGroup(commands={"tables": tables})
 
 
 def run(*arguments):

@@ -5,21 +5,30 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from evalkit.cli.group import CleanGroup
 from evalkit.cli.tracking import tracking
 from evalkit.inputs.result_files import load_result_files
 from evalkit.tracking import frames_of, track_scores, tracks_of
 from posecore import se3
-from posecore.bop import BopDataset, BopWriter, Estimate, GroundTruth, write_models, write_results, write_targets
-from posecore.bop.annotations import Target
+from posecore.bop import (
+    BopDataset,
+    BopWriter,
+    Estimate,
+    FrameRecord,
+    GroundTruth,
+    write_models,
+    write_results,
+    write_targets,
+)
+from posecore.bop.annotations import BopTarget
 from posecore.camera import Camera
+from posecore.command_line import ErrorReportingGroup
 from posecore.errors import ResultFileError
 from posecore.mesh import load_mesh
 
 TUG, BOBBIN = 1, 5
 FRAMES = tuple(range(10, 30, 2))  # ten frames with gaps in their numbers, which are no gaps in time
 CAMERA = Camera(K=np.array([[100.0, 0, 16], [0, 100, 12], [0, 0, 1]]), width_px=32, height_px=24)
-GROUP = CleanGroup(commands={"tracking": tracking})
+GROUP = ErrorReportingGroup(commands={"tracking": tracking})
 
 
 def pose(frame, x_m):
@@ -35,7 +44,17 @@ def write_sequence(root, tug_ply, bobbin_ply):
         for frame in FRAMES:
             poses = [(BOBBIN, -0.1), (TUG, 0.0), (BOBBIN, 0.1)]
             gts = [GroundTruth(obj_id=obj_id, T_cam_obj=pose(frame, x_m)) for obj_id, x_m in poses]
-            writer.add_frame(frame, np.zeros((24, 32, 3), np.uint8), None, CAMERA, gts, [mask] * 3, [mask] * 3)
+            writer.add_frame(
+                frame,
+                FrameRecord(
+                    rgb=np.zeros((24, 32, 3), np.uint8),
+                    depth_m=None,
+                    camera=CAMERA,
+                    gts=gts,
+                    masks=[mask] * 3,
+                    masks_visib=[mask] * 3,
+                ),
+            )
     return root
 
 
@@ -98,7 +117,7 @@ def test_of_several_estimates_the_best_scored_counts(sequence, tmp_path):
 
 def test_targets_say_what_is_expected_unless_all_frames_are_wanted(sequence, tmp_path, tug_ply, bobbin_ply):
     root = write_sequence(tmp_path / "video", tug_ply, bobbin_ply)
-    write_targets(root, "test", [Target(scene_id=3, im_id=frame, obj_id=TUG) for frame in FRAMES[::5]])
+    write_targets(root, "test", [BopTarget(scene_id=3, im_id=frame, obj_id=TUG) for frame in FRAMES[::5]])
     write_results(tmp_path / "r.csv", tugs())
     (tug,) = read(tmp_path / "r.csv", root)
     assert tug.im_id.tolist() == [10, 20]

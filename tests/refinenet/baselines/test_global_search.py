@@ -193,7 +193,7 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
     camera = Camera(K=K, width_px=frame.image.shape[1], height_px=frame.image.shape[0])
     make_bop(tmp_path / "bop", frame.image, camera, truth[None], tug)
     start = [Estimate(scene_id=1, im_id=0, obj_id=1, score=0.9, T_cam_obj=far_start(truth, 0))]
-    write_results(tmp_path / "start.csv", start, {"dataset": str(tmp_path / "bop"), "method": "start"})
+    write_results(tmp_path / "start.csv", start, {"dataset": str(tmp_path / "bop"), "method": "initial"})
     rest = ["--dataset", tmp_path / "bop", "--init", tmp_path / "start.csv", "--out", tmp_path / "x.csv", "--quiet"]
     network = ["--checkpoint", repository / "examples" / "checkpoints" / "tug_compact.safetensors"]
     result = cli("refine", "--method", "search", *network, *rest, "--iterations", 1, "--threads", 1)

@@ -88,7 +88,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     assert sidecar["method"] == "mine"
     assert sidecar["checkpoint_sha256"] == checkpoint.load(trained).sha256
     assert sidecar["perturbation"] == {"rows": [{"line": 2}]}
-    assert sidecar["start_lines"] == [2, 3]
+    assert sidecar["initial_lines"] == [2, 3]
     assert sidecar["failed_lines"] == [4]
     assert "behind the camera" in sidecar["failures"]["4"]
     assert f"Failed: {start}:4: scene 1, image 0, object 1: at z = " in result.stderr
@@ -98,7 +98,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     assert "1 failed (start poses kept)" in result.stdout
     kept, sidecar = read_results(out), read_sidecar(out)
     assert sidecar["settings"]["min_confidence"] == 0
-    assert (len(kept), sidecar["start_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
+    assert (len(kept), sidecar["initial_lines"], sidecar["failed_lines"]) == (3, [2, 3, 4], [4])
     assert kept[2].score == 0
     np.testing.assert_allclose(kept[2].T_cam_obj, starts[2].T_cam_obj)
     between = (kept[0].score + kept[1].score) / 2
@@ -107,7 +107,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     doubted, sidecar = min(kept[:2], key=lambda estimate: estimate.score), read_sidecar(out)
     why = f"after 1 updates its confidence is {doubted.score:.3f}, {between:g} needed"
     assert sidecar["failures"][str(doubted.line)] == why
-    assert sidecar["start_lines"] == [{2: 3, 3: 2}[doubted.line]]
+    assert sidecar["initial_lines"] == [{2: 3, 3: 2}[doubted.line]]
 
 
 def test_what_was_finished_is_written_when_something_ends_it(cli, two_images, trained, tmp_path, monkeypatch):
@@ -133,7 +133,7 @@ def test_what_was_finished_is_written_when_something_ends_it(cli, two_images, tr
     assert "000001" in result.stderr.splitlines()[-1]
     assert result.stderr.splitlines()[-1].startswith("Error: ")
     assert (len(read_results(out)), read_sidecar(out)["not_reached"]) == (2, 1)
-    assert read_sidecar(out)["start_lines"] == [3, 4]
+    assert read_sidecar(out)["initial_lines"] == [3, 4]
     second.write_bytes(picture)
     calls = []
 

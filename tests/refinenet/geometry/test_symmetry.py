@@ -5,7 +5,7 @@ import pytest
 import torch
 from posecore import se3
 from posecore.bop import ModelInfo
-from posecore.symmetry import ContinuousSymmetry
+from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
 from refinenet.data.objects import object_points
 from refinenet.geometry import poses, symmetry
 from refinenet.training import losses, validation
@@ -125,3 +125,18 @@ def test_the_contour_loss_does_not_mind_which_twin_is_the_truth(mesh, name):
     torch.testing.assert_close(cost(update, target), cost(update, other), atol=1e-4, rtol=1e-4)
     unaware = losses.contour_loss_px(update, target) - losses.contour_loss_px(update, other)
     assert unaware.abs().max() > 1
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_torch_and_numpy_have_one_definition(mesh, name):
+    """`posecore.symmetry.nearest_symmetric` is the reference: no samples of continuous symmetries at all."""
+    rng = np.random.default_rng(5)
+    info = MODELS[name]
+    objects, T_gt, rows = objects_with(mesh, info), random_poses(rng), torch.zeros(N, dtype=torch.int64)
+    T = np.stack([se3.perturb(pose, np.deg2rad(25), 0.03, rng) for pose in T_gt @ turns(info, rng)])
+    by_angle = symmetry.nearest_by_angle(torch.from_numpy(T), torch.from_numpy(T_gt), rows, objects)
+    np.testing.assert_allclose(by_angle, nearest_symmetric(T_gt, T, info), atol=1e-6)
+    by_points, _ = symmetry.nearest_by_points(torch.from_numpy(T), torch.from_numpy(T_gt), rows, objects)
+    points_m = objects.points_m[0].numpy()
+    reference = nearest_symmetric(T_gt, T, info, by="points", points_m=points_m)
+    np.testing.assert_allclose(by_points, reference, atol=1e-3 if name == "ball" else 1e-5)  # a ball's axes by sweeps

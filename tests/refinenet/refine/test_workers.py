@@ -58,7 +58,7 @@ def test_what_was_finished_before_a_damaged_image_is_kept(cli, two_images, train
     assert result.exit_code == 1
     assert f"Stopped: 1 start poses were not reached, {out} holds the others" in result.stderr
     assert result.stderr.splitlines()[-1].startswith(f"Error: {second}")
-    assert read_sidecar(out)["start_lines"] == [3, 4]
+    assert read_sidecar(out)["initial_lines"] == [3, 4]
 
 
 def ignores_interrupts(pid):

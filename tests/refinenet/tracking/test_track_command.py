@@ -16,6 +16,7 @@ from posecore.bop import (
     BopDataset,
     BopWriter,
     Estimate,
+    FrameRecord,
     GroundTruth,
     ModelInfo,
     read_results,
@@ -72,7 +73,17 @@ def write_scene(root, mesh, truths, gone, info=None):
             mask = (layers.instance == 0) & (frame not in gone)
             image = np.where(mask[..., None], layers.rgb, behind)
             gt = GroundTruth(obj_id=1, T_cam_obj=T, gt_index=0)
-            writer.add_frame(frame, image, np.where(mask, layers.depth_m, 0), camera, [gt], [mask], [mask])
+            writer.add_frame(
+                frame,
+                FrameRecord(
+                    rgb=image,
+                    depth_m=np.where(mask, layers.depth_m, 0),
+                    camera=camera,
+                    gts=[gt],
+                    masks=[mask],
+                    masks_visib=[mask],
+                ),
+            )
     write_models(root, {1: mesh}, {} if info is None else {1: info})
 
 

@@ -213,7 +213,7 @@ def test_training_images_are_jpeg_share_their_scene_and_have_no_targets(tmp_path
     dataset = BopDataset(tmp_path / "p", "train_pbr")
     assert [(s, dataset.im_ids(s)) for s in dataset.scene_ids] == [(0, [0, 1]), (1, [0])]
     assert not list((tmp_path / "p").glob("*targets*"))
-    assert dataset.image_path(0, 0).suffix == ".jpg"
+    assert dataset.image_file(0, 0).path.suffix == ".jpg"
     cameras = json.loads((tmp_path / "p/train_pbr/000000/scene_camera.json").read_text())
     in_world = []
     for im_id in (0, 1):

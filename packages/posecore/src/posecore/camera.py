@@ -11,8 +11,6 @@ from jaxtyping import Float
 from posecore.errors import CameraError
 from posecore.window import Window
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
@@ -24,7 +22,7 @@ class Camera:
         height_px: Image height.
     """
 
-    K: Float[Array, "3 3"]
+    K: Float[np.ndarray, "3 3"]
     width_px: int
     height_px: int
 
@@ -39,12 +37,12 @@ class Camera:
             raise CameraError(f"image size: found {self.width_px} x {self.height_px} px, expected at least 1 x 1")
 
 
-def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[Array, "3 3"]:
+def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:
     """Camera matrix from focal lengths and principal point, pixels."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def project(K: Float[Array, "*k 3 3"], p_cam: Float[Array, "*b n 3"]) -> Float[Array, "*c n 2"]:
+def project(K: Float[np.ndarray, "*k 3 3"], p_cam: Float[np.ndarray, "*b n 3"]) -> Float[np.ndarray, "*c n 2"]:
     """Project camera-frame points (metres) to pixels: u = fx X/Z + cx, v = fy Y/Z + cy.
 
     A point in the camera's plane (Z = 0) gives inf or NaN; one behind it gives its mirrored projection.
@@ -56,15 +54,15 @@ def project(K: Float[Array, "*k 3 3"], p_cam: Float[Array, "*b n 3"]) -> Float[A
 
 
 def back_project(
-    K: Float[Array, "3 3"], uv_px: Float[Array, "*n 2"], depth_m: Float[Array, "*n"]
-) -> Float[Array, "*n 3"]:
+    K: Float[np.ndarray, "3 3"], uv_px: Float[np.ndarray, "*n 2"], depth_m: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 3"]:
     """Lift pixels with camera z (metres) to camera-frame points."""
     x = (uv_px[..., 0] - K[0, 2]) / K[0, 0] * depth_m
     y = (uv_px[..., 1] - K[1, 2]) / K[1, 1] * depth_m
     return np.stack([x, y, depth_m * np.ones_like(x)], -1)
 
 
-def crop_K(K: Float[Array, "3 3"], window: Window, patch_px: int) -> Float[Array, "3 3"]:
+def crop_K(K: Float[np.ndarray, "3 3"], window: Window, patch_px: int) -> Float[np.ndarray, "3 3"]:
     """Intrinsics of the square patch that `window.cut` makes of the image."""
     scale = patch_px / window.side_px
     return intrinsics(

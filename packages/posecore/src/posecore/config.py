@@ -1,6 +1,20 @@
-"""Frozen dataclasses from YAML: nested, every key and type checked, unknown keys rejected by name."""
+"""Frozen dataclasses from YAML: nested, every key, type and range checked, unknown keys rejected by name.
+
+Ranges stand beside the fields:
+
+    @dataclass(frozen=True, kw_only=True)
+    class SensorConfig:
+        jpeg_fraction: Annotated[float, Range(0, 1)] = 0.5
+        blur_sigma_px: Annotated[tuple[float, float], Range(0, 20)] = (0.0, 0.9)  # low <= high, both within
+        widths: tuple[Annotated[int, Range(1)], ...] = (96, 128)  # each
+        scale: Annotated[float, Range(0, 5, above=True, unit="diameters")] | None = None
+
+        def __post_init__(self) -> None:
+            check_ranges(self)
+"""
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping, Sequence
@@ -10,8 +24,84 @@ from typing import Any, TypeVar
 import yaml
 
 from posecore.errors import ConfigError
+from posecore.renamed import refuse_renamed_keys
 
 T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Range:
+    """Values that a field may have, as metadata of its type: `Annotated[float, Range(0, 1)]`.
+
+    On a number it bounds the number, on a pair it demands low <= high within the bounds; None is in every range.
+
+    Attributes:
+        low: Smallest value.
+        high: Largest value.
+        above: Whether `low` itself is excluded.
+        under: Whether `high` itself is excluded.
+        unit: For messages, in the plural.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+    under: bool = False
+    unit: str = ""
+
+    def __contains__(self, value: float) -> bool:
+        is_high_enough = value > self.low if self.above else value >= self.low
+        is_low_enough = value < self.high if self.under else value <= self.high
+        return math.isfinite(value) and is_high_enough and is_low_enough
+
+    def __str__(self) -> str:
+        low, high = f"{'above ' if self.above else ''}{self.low:g}", f"{'under ' if self.under else ''}{self.high:g}"
+        if math.isinf(self.high):
+            text = low if self.above else f"{low} or more"
+        elif math.isinf(self.low):
+            text = high if self.under else f"{high} or less"
+        else:
+            text = f"{low} to {high}"
+        return f"{text} {self.unit}".rstrip()
+
+
+def check_ranges(config: Any) -> None:
+    """Hold the fields of a dataclass against their ranges; call this first in its `__post_init__`.
+
+    Raises:
+        ConfigError: A value is outside of its range; the message names field, value and range.
+    """
+    for name, hint in _hints(type(config)).items():
+        _check_range(name, getattr(config, name), hint, None)
+
+
+def _hints(cls: type) -> Mapping[str, Any]:
+    hints = typing.get_type_hints(cls, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _check_range(name: str, value: Any, hint: Any, limits: Range | None) -> None:
+    """Check a value against the range around its type, and its parts against the ranges within."""
+    if value is None:
+        return
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        for limits in (item for item in arguments[1:] if isinstance(item, Range)):
+            _check_range(name, value, arguments[0], limits)
+    elif origin in (typing.Union, types.UnionType):
+        for argument in arguments:
+            if argument is not type(None):
+                _check_range(name, value, argument, limits)
+    elif origin is tuple:
+        if limits is not None:
+            low, high = value
+            if not (low in limits and high in limits and low <= high):
+                raise ConfigError(f"{name} is [{low}, {high}], expected low <= high within {limits}")
+        for index, part in enumerate(value):
+            part_hint = arguments[0] if arguments[-1] is Ellipsis else arguments[index]
+            _check_range(f"{name}[{index}]", part, part_hint, None)
+    elif limits is not None and value not in limits:
+        raise ConfigError(f"{name} is {value}, expected {limits}")
 
 
 def load_yaml(path: str | Path) -> dict[str, Any]:
@@ -69,10 +159,10 @@ def assigned_keys(overrides: Sequence[str]) -> list[str]:
 
 
 def _leaves(mapping: Mapping[str, Any], prefix: str) -> list[str]:
-    found: list[str] = []
+    keys: list[str] = []
     for key, value in mapping.items():
-        found += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
-    return found
+        keys += _leaves(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [f"{prefix}{key}"]
+    return keys
 
 
 def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
@@ -84,17 +174,21 @@ def merge(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def build(cls: type[T], mapping: Mapping[str, Any], where: str) -> T:
+def build(cls: type[T], mapping: Mapping[str, Any], where: str, renamed: Mapping[str, str] | None = None) -> T:
     """Make a frozen dataclass from a mapping; keys that are left out keep their defaults.
 
     Args:
         cls: The dataclass; its fields may be dataclasses, tuples, optionals, literals and plain values.
         mapping: Values by field name.
         where: File or option, for messages.
+        renamed: Keys of earlier versions that are refused with their new name, see `posecore.renamed`; what is stored
+            can be read with `migrated_keys` first.
 
     Raises:
-        ConfigError: Unknown key, missing key, value of another type, or one that the class refuses.
+        ConfigError: Unknown, renamed or missing key, value of another type or out of range, or one that the class
+            refuses.
     """
+    refuse_renamed_keys(mapping, renamed or {}, where)
     return typing.cast(T, _build(cls, mapping, where, ""))
 
 
@@ -122,7 +216,9 @@ def _build(cls: type, mapping: Any, where: str, prefix: str) -> Any:
         if required and field.name not in values:
             raise ConfigError(f"{where}: the key {prefix}{field.name} is missing")
     try:
-        return cls(**values)
+        config = cls(**values)
+        check_ranges(config)
+        return config
     except ConfigError as error:
         raise ConfigError(f"{where}: {prefix}{error}") from error
 

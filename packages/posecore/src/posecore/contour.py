@@ -7,20 +7,19 @@ from jaxtyping import Bool, Float, Int
 from posecore.camera import back_project
 from posecore.errors import RenderError
 
-Array = np.ndarray
 _SQUARE = np.ones((3, 3), np.uint8)
 
 
-def contour_mask(mask: Bool[Array, "h w"]) -> Bool[Array, "h w"]:
+def contour_mask(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     """Silhouette minus its 3 x 3 erosion.
 
-    Where the silhouette is cut by the patch's border there is no contour: what lies outside counts as silhouette.
+    Where the silhouette is cut by the patch's border there is no contour: the outside counts as silhouette.
     """
     inner = cv2.erode(mask.astype(np.uint8), _SQUARE, borderType=cv2.BORDER_CONSTANT, borderValue=[1])
     return np.asarray(mask & (inner == 0))
 
 
-def distance_transform_px(contour: Bool[Array, "h w"]) -> Float[Array, "h w"]:
+def distance_transform_px(contour: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Unsigned exact Euclidean distance from every pixel centre to the nearest contour pixel's centre.
 
     Raises:
@@ -34,7 +33,7 @@ def distance_transform_px(contour: Bool[Array, "h w"]) -> Float[Array, "h w"]:
     return np.asarray(np.sqrt(np.rint(np.square(approximate))))
 
 
-def trace(mask: Bool[Array, "h w"]) -> Int[Array, "n 2"]:
+def trace(mask: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "n 2"]:
     """Contour pixels (row, column) in order along the outlines, outer ones and holes, each once."""
     outlines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     if not outlines:
@@ -46,20 +45,20 @@ def trace(mask: Bool[Array, "h w"]) -> Int[Array, "n 2"]:
 
 
 def sample_contour(
-    mask: Bool[Array, "h w"],
-    depth_m: Float[Array, "h w"],
-    K: Float[Array, "3 3"],
+    mask: Bool[np.ndarray, "h w"],
+    depth_m: Float[np.ndarray, "h w"],
+    K: Float[np.ndarray, "3 3"],
     n: int,
     rng: np.random.Generator,
-) -> Float[Array, "n 3"]:
+) -> Float[np.ndarray, "n 3"]:
     """Draw contour points evenly along the contour and lift them with the same render's depth.
 
     Args:
         mask: Silhouette.
         depth_m: Camera z of the same render.
         K: Camera matrix of the same image.
-        n: How many; without replacement where that many contour pixels exist.
-        rng: Decides where along the contour the first one lies.
+        n: Number of points; without replacement where that many contour pixels exist.
+        rng: Draws the position of the first point along the contour.
 
     Returns:
         (n, 3) camera-frame points, metres, at pixel centres.

@@ -2,7 +2,7 @@
 
 
 class PoseError(Exception):
-    """Root of every error that a user can cause or must know about."""
+    """Root of all errors that a user can cause or has to handle."""
 
 
 class MeshError(PoseError, ValueError):
@@ -14,7 +14,7 @@ class TextureError(MeshError):
 
 
 class CameraError(PoseError, ValueError):
-    """A camera matrix or image size is not one."""
+    """A camera matrix or image size is invalid."""
 
 
 class DatasetError(PoseError, ValueError):
@@ -26,7 +26,7 @@ class ResultFileError(PoseError, ValueError):
 
 
 class ShardError(PoseError, ValueError):
-    """A shard dataset is truncated, of another schema, or not one."""
+    """A shard dataset is truncated, of another schema, or no dataset."""
 
 
 class ConfigError(PoseError, ValueError):
@@ -34,7 +34,7 @@ class ConfigError(PoseError, ValueError):
 
 
 class CheckpointError(PoseError, ValueError):
-    """A checkpoint cannot be loaded or belongs to something else."""
+    """A checkpoint cannot be loaded or belongs to another network or object."""
 
 
 class RenderError(PoseError, RuntimeError):

@@ -59,7 +59,7 @@ def _target(path: str | Path) -> Path:
         is_folder, is_other = file.is_dir(), file.exists() and not file.is_file()
     except OSError as error:
         raise storage_error(path, error) from error
-    except RuntimeError as error:  # what Python 3.11 says of links in a circle
+    except RuntimeError as error:  # Python 3.11 on links in a circle
         raise StorageError(f"{path}: a link that leads back to itself; choose another path") from error
     if is_folder:
         raise StorageError(f"{path}: a folder stands where a file is needed; choose another path")
@@ -69,7 +69,7 @@ def _target(path: str | Path) -> Path:
 
 
 def storage_error(path: str | Path, error: OSError, size_bytes: int | None = None) -> StorageError:
-    """Turn an OSError into one line that says what to do."""
+    """Turn an OSError into one line with a remedy."""
     if error.errno == errno.ENOSPC:
         size = "" if size_bytes is None else f" of {size_bytes} bytes"
         return StorageError(f"{path}: the disk is full, this write{size} failed; free some space and start again")
@@ -104,6 +104,6 @@ def data_spec(name: str) -> Path:
     """
     path = Path(__file__).parent / "data_specs" / name
     if not path.exists():
-        known = sorted(p.stem for p in path.parent.glob("*")) if path.parent.is_dir() else []
-        raise ConfigError(f"{path}: no such data specification; there are: {', '.join(known) or 'none'}")
+        names = sorted(p.stem for p in path.parent.glob("*")) if path.parent.is_dir() else []
+        raise ConfigError(f"{path}: no such data specification; there are: {', '.join(names) or 'none'}")
     return path

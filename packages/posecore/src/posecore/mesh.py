@@ -24,7 +24,6 @@ from posecore.ply import refuse_broken_ply
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
 
-Array = np.ndarray
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 DIAMETER_RANGE_M = (2e-3, 10.0)
@@ -41,16 +40,16 @@ class Mesh:
         vertex_rgb: (v, 3) display (sRGB) colours, or None.
         uv: (v, 2) texture coordinates, origin at the texture's bottom left, or None.
         texture_rgb: (h, w, 3) display colours, row 0 at the top, or None.
-        path: Where it came from.
+        path: Source file.
         sha256: Hash of that file's bytes.
     """
 
-    vertices_m: Float[Array, "v 3"]
-    faces: Int[Array, "f 3"]
-    normals: Float[Array, "v 3"]
-    vertex_rgb: UInt8[Array, "v 3"] | None = None
-    uv: Float[Array, "v 2"] | None = None
-    texture_rgb: UInt8[Array, "h w 3"] | None = None
+    vertices_m: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "v 3"]
+    vertex_rgb: UInt8[np.ndarray, "v 3"] | None = None
+    uv: Float[np.ndarray, "v 2"] | None = None
+    texture_rgb: UInt8[np.ndarray, "h w 3"] | None = None
     path: str = ""
     sha256: str = ""
 
@@ -60,13 +59,17 @@ class Mesh:
         return diameter(self.vertices_m)
 
     @cached_property
-    def center_m(self) -> Float[Array, "3"]:
+    def center_m(self) -> Float[np.ndarray, "3"]:
         """Centre of the axis-aligned bounding box in object coordinates, metres."""
         return np.asarray((self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2)
 
+    def center_cam_m(self, T_cam_obj: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3"]:
+        """Centre of the bounding box in camera coordinates at each pose, metres."""
+        return np.asarray(T_cam_obj[..., :3, :3] @ self.center_m + T_cam_obj[..., :3, 3])
+
     @cached_property
-    def colours(self) -> UInt8[Array, "v 3"]:
-        """Vertex colours; sampled from the texture where there is one, mid grey where there is nothing."""
+    def colours(self) -> UInt8[np.ndarray, "v 3"]:
+        """Vertex colours; sampled from the texture where there is one, mid grey without either."""
         if self.vertex_rgb is not None:
             return self.vertex_rgb
         if self.uv is not None and self.texture_rgb is not None:
@@ -78,17 +81,17 @@ class Mesh:
 
     @cached_property
     def is_closed(self) -> bool:
-        """Whether the surface is closed and turned outwards, so that no back face is ever seen from outside.
+        """Whether the surface is closed and oriented outwards, so that no back face is visible from outside.
 
-        Vertices at one place count as one. Every directed edge must have its opposite, and every connected piece must
-        enclose a positive volume.
+        Vertices at the same position count as one. Every directed edge must have its opposite, and every connected
+        piece must enclose a positive volume.
         """
-        _, place = np.unique(self.vertices_m.round(9), axis=0, return_inverse=True)
-        faces = place.reshape(-1)[self.faces]
+        _, merged = np.unique(self.vertices_m.round(9), axis=0, return_inverse=True)
+        faces = merged.reshape(-1)[self.faces]
         proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
         faces, corners_m = faces[proper], self.vertices_m[self.faces[proper]]
         edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        n = int(place.max()) + 1
+        n = int(merged.max()) + 1
         if not np.array_equal(np.sort(edges @ [n, 1]), np.sort(edges @ [1, n])):
             return False
         links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
@@ -98,26 +101,26 @@ class Mesh:
         return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
 
 
-def diameter(points_m: Float[Array, "v 3"]) -> float:
+def diameter(points_m: Float[np.ndarray, "v 3"]) -> float:
     """Largest distance between two points, over their convex hull."""
     points = np.asarray(points_m, np.float64)
     try:
         points = points[ConvexHull(points).vertices]
-    except QhullError:  # flat or fewer than four points: every pair is looked at
+    except QhullError:  # flat or fewer than four points: all pairs
         points = np.unique(points, axis=0)
     if len(points) < 2:
         return 0.0
     # The ends of the longest distance are both far from the middle: no nearer to it than that distance minus the
     # largest radius. Most vertices of a smooth part are.
     radius = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1)
-    found = cdist(points[[radius.argmax()]], points).max()
-    points = points[radius >= (1 - 1e-9) * found - radius.max()]
+    at_least = cdist(points[[radius.argmax()]], points).max()
+    points = points[radius >= (1 - 1e-9) * at_least - radius.max()]
     blocks = range(0, len(points), 512)  # of rows, so that memory stays bounded for a sphere, where all are left
     return max(float(cdist(points[i : i + 512], points[i:]).max()) for i in blocks)
 
 
 def mesh_digest(mesh: Mesh) -> str:
-    """Hash of what a mesh looks like: vertices (float32 millimetres), faces, colours, texture.
+    """Hash of geometry and appearance: vertices (float32 millimetres), faces, colours, texture.
 
     Unlike the file's hash it stays the same when the mesh is written anew, as BOP datasets do.
     """
@@ -133,7 +136,7 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
 
     Args:
         path: The file. Several geometries in one file are merged.
-        units: Unit of the file's coordinates. glTF is in metres by its specification: say `m`.
+        units: Unit of the file's coordinates. glTF is in metres by its specification: give `m`.
         allow_missing_textures: Whether a mesh whose texture or material file is missing or broken has its vertex
             colours or its material's plain colour instead.
 
@@ -177,7 +180,7 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
     return mesh
 
 
-def _unit(normals: Float[Array, "v 3"]) -> Float[Array, "v 3"]:
+def _unit(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     """Normals of length 1, as files need not hold them (MeshLab writes sums of angles); zero stays zero."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
@@ -186,7 +189,7 @@ def _unit(normals: Float[Array, "v 3"]) -> Float[Array, "v 3"]:
 def _read(file: Path) -> trimesh.Trimesh:
     try:
         # An OBJ's vertex on a texture seam becomes one vertex for each of its texture coordinates. With maintain_order
-        # it would keep one of them, and the texture would smear along the seam.
+        # it would keep a single coordinate, and the texture would smear along the seam.
         loaded = trimesh.load(file, process=False)
     except Exception as error:  # readers raise whatever they stumble over
         reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0][:200]
@@ -219,7 +222,7 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
 
 def _appearance(
     file: Path, geometry: trimesh.Trimesh, allow_missing_textures: bool
-) -> tuple[UInt8[Array, "v 3"] | None, Float[Array, "v 2"] | None, UInt8[Array, "h w 3"] | None]:
+) -> tuple[UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, "v 2"] | None, UInt8[np.ndarray, "h w 3"] | None]:
     visual: Any = geometry.visual
     material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
@@ -238,7 +241,7 @@ def _appearance(
 
 
 def _refuse_missing_texture(file: Path) -> None:
-    """A material that names an image which is not there, or is none, is an error, never a silent grey."""
+    """Refuse a material whose image is missing or no image: it would silently become grey."""
     try:
         textures = _textures(file)
         missing = [texture for texture in textures if not texture.is_file()]
@@ -264,7 +267,7 @@ def _textures(file: Path) -> list[Path]:
         return [file.parent / line.split(maxsplit=2)[2].strip() for line in header if _names_texture(line)]
     if file.suffix.lower() != ".obj":
         return []
-    found = []
+    textures = []
     for line in file.read_text(errors="replace").splitlines():
         if not line.startswith("mtllib "):
             continue
@@ -272,8 +275,8 @@ def _textures(file: Path) -> list[Path]:
         if not material.is_file():
             raise TextureError(f"{file}: its material file {material} is missing; put it beside the mesh")
         entries = material.read_text(errors="replace").splitlines()
-        found += [file.parent / e.split(maxsplit=1)[1].strip() for e in entries if e.strip().startswith("map_Kd ")]
-    return found
+        textures += [file.parent / e.split(maxsplit=1)[1].strip() for e in entries if e.strip().startswith("map_Kd ")]
+    return textures
 
 
 def _names_texture(line: str) -> bool:

@@ -1,4 +1,4 @@
-"""Loops that numpy has no words for, compiled."""
+"""`numba.njit` with an on-disk cache, or without where nothing can be written."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,7 +7,7 @@ import numba
 
 
 def compiled(loop: Callable[..., Any]) -> Callable[..., Any]:
-    """A function compiled at its first call and kept on disk beside its file, or where NUMBA_CACHE_DIR says.
+    """A function compiled at its first call, cached on disk beside its file or in NUMBA_CACHE_DIR.
 
     Where no folder can be written to, each process compiles anew.
     """

@@ -1,4 +1,4 @@
-"""ASCII PLY files held against their own header: what a lenient reader would skip, shift or round is refused."""
+"""Strict check of ASCII PLY files against their header: a lenient reader would skip, shift or round values."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,7 +19,7 @@ class _Element:
 
 
 def refuse_broken_ply(file: Path, data: bytes) -> None:
-    """Refuse an ASCII PLY whose rows are not what its header says.
+    """Refuse an ASCII PLY whose rows contradict its header.
 
     Readers take a file that is cut off for one with fewer faces, `3O.5` for 3 and `10-20` for two numbers. Binary files
     are left alone: their length gives them away.
@@ -39,10 +39,10 @@ def refuse_broken_ply(file: Path, data: bytes) -> None:
     first_line = len(lines) + 2
     row = 0
     for element in _elements(lines):
-        there = sum(bool(text.strip()) for text in rows[row:])
-        if there < element.count:
+        n_rows = sum(bool(text.strip()) for text in rows[row:])
+        if n_rows < element.count:
             raise MeshError(
-                f"{file}: has {there} rows of '{element.name}', its header says {element.count}; the file is cut off"
+                f"{file}: has {n_rows} rows of '{element.name}', its header gives {element.count}; the file is cut off"
             )
         for text in rows[row : row + element.count]:
             reason = _wrong_row(text, element)
@@ -66,7 +66,7 @@ def _elements(lines: list[str]) -> Iterator[_Element]:
 
 
 def _wrong_row(text: bytes, element: _Element) -> str:
-    """What is wrong in a row, or nothing."""
+    """Fault of a row, or an empty string."""
     words = text.split()
     if text.translate(None, _NUMBER_CHARACTERS) and any(
         word.translate(None, _NUMBER_CHARACTERS) and word.lower().strip(b"+-") not in _NO_NUMBERS for word in words
@@ -86,7 +86,7 @@ def _wrong_row(text: bytes, element: _Element) -> str:
         if element.name == "face" and position == 0 and not all(word.isdigit() for word in inside):
             return "names a vertex by something that is no whole number"
         position += 1 + size
-    return "" if position == len(words) else f"has {len(words)} numbers, its header says {position}"
+    return "" if position == len(words) else f"has {len(words)} numbers, its header gives {position}"
 
 
 def _is_count(word: str | bytes) -> bool:

@@ -1,4 +1,4 @@
-"""What processes that others start have in common: they end with their parent and leave ctrl-C to it."""
+"""Child processes: they exit with their parent and ignore Ctrl-C; pools for tasks."""
 
 import ctypes
 import multiprocessing
@@ -8,9 +8,10 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from itertools import chain, islice
 from typing import Any, TypeVar
 
 from posecore.errors import RenderError
@@ -21,7 +22,7 @@ _PR_SET_PDEATHSIG = 1
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
-    """Start processes that ignore ctrl-C: a terminal sends it to all, and only the driver may stop the run.
+    """Start processes that ignore Ctrl-C: a terminal sends it to all, and only the parent may stop the run.
 
     A process inherits what its parent ignores. A signal mask would not do: multiprocessing clears it.
     """
@@ -36,20 +37,20 @@ def interrupts_ignored() -> Iterator[None]:
 
 
 def die_with_parent() -> None:
-    """Have the kernel kill this process when its parent is gone, also by `kill -9` and while this one hangs.
+    """Have the kernel kill this process when its parent exits, also by `kill -9` and while this process hangs.
 
-    Only Linux can do that; elsewhere nothing happens, and multiprocessing's own watch has to do.
+    Only Linux can do that; elsewhere nothing happens, and only multiprocessing's own watch remains.
     """
     if sys.platform != "linux":
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     parent = multiprocessing.parent_process()
-    if parent is not None and os.getppid() != parent.pid:  # it went before the kernel was told
+    if parent is not None and os.getppid() != parent.pid:  # the parent exited before prctl took effect
         os._exit(1)
 
 
 def behave_as_worker() -> None:
-    """What a worker process does first: it ends with its parent, and leaves ctrl-C to it."""
+    """Prepare a worker process: it exits with its parent and ignores Ctrl-C."""
     die_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -58,16 +59,16 @@ def behave_as_worker() -> None:
 def spawned(
     workers: int, start: Callable[..., None], arguments: tuple[Any, ...], died: str
 ) -> Iterator[ProcessPoolExecutor]:
-    """A pool of processes, spawned because a forked GL context is undefined. At an error they end at once.
+    """A pool of spawned processes (a forked GL context is undefined); at an error they end at once.
 
     Args:
-        workers: How many.
+        workers: Number of processes.
         start: Called first in each; it begins with `behave_as_worker`.
         arguments: Its arguments.
-        died: What to say when one dies.
+        died: Message when a process dies.
 
     Raises:
-        RenderError: One died.
+        RenderError: A process died.
     """
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
@@ -90,7 +91,7 @@ def spawned(
 
 
 def in_order(pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Iterable[T], ahead: int) -> Iterator[R]:
-    """Results in the order of the tasks; at most `ahead` are made before they are asked for, as they take memory."""
+    """Results in the order of the tasks; at most `ahead` are computed in advance, as they take memory."""
     waiting: deque[Future[R]] = deque()
     for task in tasks:
         waiting.append(pool.submit(function, task))
@@ -98,3 +99,84 @@ def in_order(pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Itera
             yield waiting.popleft().result()
     while waiting:
         yield waiting.popleft().result()
+
+
+def unordered(
+    pool: ProcessPoolExecutor, function: Callable[[T], R], tasks: Iterable[T], ahead: int
+) -> Iterator[tuple[T, R]]:
+    """Tasks with their results, as they finish; at most `ahead` are submitted at once."""
+    numbered = ((number, task) for number, task in enumerate(tasks))
+    submitted: dict[int, T] = {}
+    for number, result in _finished(pool, function, numbered, submitted, ahead):
+        yield submitted.pop(number), result
+
+
+def map_unordered(
+    job: Callable[[T], R],
+    items: Iterable[T],
+    workers: int,
+    *,
+    start: Callable[..., None] = behave_as_worker,
+    arguments: tuple[Any, ...] = (),
+    died: Callable[[T], str],
+    ahead: int = 2,
+    attempts: int = 1,
+    on_crash: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[T, R]]:
+    """Items with their results from new processes, as they finish; processes that die are replaced.
+
+    Once the results are exhausted, the processes end; at an error, or if the iterator is closed, they end at once.
+
+    Args:
+        job: A function of a module, called with an item in a process.
+        items: Taken from the iterable as processes become free; any picklable values.
+        workers: Number of processes.
+        start: Called first in each process; it begins with `behave_as_worker`.
+        arguments: Its arguments.
+        died: The message, from the first item without a result, when too many processes die.
+        ahead: Items submitted at once for each process.
+        attempts: Crashes in a row, without a result in between, that end the run; each lesser number is retried.
+        on_crash: Called after a crash with no process running, for example to delete partial files.
+
+    Raises:
+        RenderError: Processes died `attempts` times in a row.
+    """
+    numbered = enumerate(items)
+    submitted: dict[int, T] = {}
+    crashes = 0
+    while True:
+        crash: BrokenProcessPool | None = None
+        with spawned(workers, start, arguments, "a worker process died") as pool:
+            again = tuple(sorted(submitted.items()))
+            try:
+                for number, result in _finished(pool, job, chain(again, numbered), submitted, ahead * workers):
+                    crashes = 0
+                    yield submitted.pop(number), result
+            except BrokenProcessPool as error:
+                crash = error
+        if crash is None:
+            return
+        crashes += 1
+        on_crash()
+        if crashes == attempts:
+            raise RenderError(died(submitted[min(submitted)])) from crash
+
+
+def _finished(
+    pool: ProcessPoolExecutor,
+    function: Callable[[T], R],
+    numbered: Iterable[tuple[int, T]],
+    submitted: dict[int, T],
+    ahead: int,
+) -> Iterator[tuple[int, R]]:
+    """Numbers of finished tasks with results; `submitted` also gets each task before it runs."""
+    waiting = iter(numbered)
+    running: dict[Future[R], int] = {}
+    while True:
+        for number, task in islice(waiting, ahead - len(running)):
+            submitted[number] = task
+            running[pool.submit(function, task)] = number
+        if not running:
+            return
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            yield running.pop(future), future.result()

@@ -1,4 +1,4 @@
-"""Meshes with fewer faces, for pictures so small that the rest could not be seen."""
+"""Mesh decimation for small renders."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from posecore.mesh import Mesh
 
 
 def simplified(mesh: Mesh, max_faces: int) -> Mesh:
-    """A mesh of about `max_faces` faces that looks the same from afar.
+    """A mesh of about `max_faces` faces with the same appearance from a distance.
 
     Edges are collapsed where the surface moves least; colours and normals are those of the nearest vertex of the
     original. A mesh that is small enough is returned as it is, and so is a textured one: its texture coordinates would
@@ -19,18 +19,18 @@ def simplified(mesh: Mesh, max_faces: int) -> Mesh:
 
     Args:
         mesh: Mesh.
-        max_faces: Faces wanted; some more remain where nothing can be collapsed without tearing the surface.
+        max_faces: Number of faces; some more remain where nothing can be collapsed without tearing the surface.
 
     Source: Garland and Heckbert, Surface Simplification Using Quadric Error Metrics, SIGGRAPH 1997.
     """
     if len(mesh.faces) <= max_faces or mesh.texture_rgb is not None:
         return mesh
-    # Vertices at one place count as one: of triangles that hang together in nothing, whole ones would be dropped.
-    _, first, place = np.unique(mesh.vertices_m.round(9), axis=0, return_index=True, return_inverse=True)
+    # Vertices at the same position are merged: unconnected triangles would be dropped as a whole.
+    _, first, merged = np.unique(mesh.vertices_m.round(9), axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))  # the order of the file, which the result depends on
     vertices_m, faces = fast_simplification.simplify(
         mesh.vertices_m[np.sort(first)].astype(np.float32),
-        rank[place.reshape(-1)][mesh.faces].astype(np.int32),
+        rank[merged.reshape(-1)][mesh.faces].astype(np.int32),
         target_count=max_faces,
     )
     nearest = cKDTree(mesh.vertices_m).query(vertices_m)[1]

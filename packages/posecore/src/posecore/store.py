@@ -1,4 +1,4 @@
-"""Where a dataset's files lie: a local folder, or any fsspec URL (s3://, gs://, memory://)."""
+"""Storage of a dataset: a local folder, or any fsspec URL (s3://, gs://, memory://)."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -42,14 +42,14 @@ class LocalStore:
             raise storage_error(self.root / key, error) from error
 
     def set(self, key: str, data: bytes) -> None:
-        """Write a file under a temporary name, then rename it; what a killed writer left of it goes."""
+        """Write a file under a temporary name, then rename it; remains of a killed writer are deleted."""
         file = self.root / key
         write_atomic(file, data)
         for left in file.parent.glob(f".{file.name}.*.tmp"):
             left.unlink(missing_ok=True)
 
     def list_names(self) -> list[str]:
-        """Names in the folder; what a killed writer left under a temporary name does not count."""
+        """Names in the folder without the temporary files of killed writers."""
         if self.root.is_file():
             raise StorageError(f"{self.root}: is a file, expected a folder for the dataset; choose another path")
         return sorted(p.name for p in self.root.glob("*") if not p.name.endswith(".tmp"))
@@ -61,7 +61,7 @@ class LocalStore:
 
 
 class FsspecStore:
-    """Any filesystem that fsspec knows. Object stores write a whole object or none."""
+    """Any filesystem of fsspec. Object stores write a whole object or none."""
 
     def __init__(self, url: str) -> None:
         import fsspec
@@ -78,7 +78,7 @@ class FsspecStore:
             try:
                 return bytes(self._fs.cat_file(f"{self._root}/{key}"))
             except FileNotFoundError as error:
-                if _says_no_bucket(error):
+                if _is_bucket_missing(error):
                     raise
         return None
 
@@ -89,7 +89,7 @@ class FsspecStore:
             try:
                 self._fs.pipe_file(path, data)
             except FileNotFoundError as error:  # a filesystem with real folders
-                if _says_no_bucket(error):  # making folders would make the bucket
+                if _is_bucket_missing(error):  # making folders would make the bucket
                     raise
                 self._fs.makedirs(path.rsplit("/", 1)[0], exist_ok=True)
                 self._fs.pipe_file(path, data)
@@ -101,7 +101,7 @@ class FsspecStore:
             try:
                 entries: list[Any] = self._fs.ls(self._root, detail=False)
             except FileNotFoundError as error:
-                if _says_no_bucket(error):
+                if _is_bucket_missing(error):
                     raise
                 return []
         return sorted(str(entry).rstrip("/").rsplit("/", 1)[-1] for entry in entries)
@@ -110,13 +110,13 @@ class FsspecStore:
         """Bytes of every object below a folder, by key."""
         with self._errors(folder):
             self._fs.invalidate_cache()
-            found: dict[str, Any] = self._fs.find(f"{self._root}/{folder}", detail=True)
+            entries: dict[str, Any] = self._fs.find(f"{self._root}/{folder}", detail=True)
         start = len(str(self._root).strip("/")) + 1
-        return {path.strip("/")[start:]: int(entry["size"]) for path, entry in found.items()}
+        return {path.strip("/")[start:]: int(entry["size"]) for path, entry in entries.items()}
 
     @contextmanager
     def _errors(self, key: str = "", size_bytes: int | None = None) -> Iterator[None]:
-        """Turn whatever a backend raises (few of them raise OSError only) into one line that says what to do."""
+        """Turn any exception of a backend (few raise OSError only) into one line with a remedy."""
         where = f"{self._url}/{key}" if key else self._url
         try:
             yield
@@ -128,7 +128,7 @@ class FsspecStore:
                     if self._url.startswith("s3")
                     else f"no credentials found ({text}); log in to this store"
                 )
-            elif isinstance(error, FileNotFoundError) and _says_no_bucket(error):
+            elif isinstance(error, FileNotFoundError) and _is_bucket_missing(error):
                 advice = "the bucket does not exist; create it"
             elif isinstance(error, PermissionError):
                 advice = f"access denied ({text}); use credentials that may read and write there"
@@ -141,7 +141,7 @@ class FsspecStore:
             raise StorageError(f"{where}: {advice}, or choose another place") from error
 
 
-def _says_no_bucket(error: Exception) -> bool:
+def _is_bucket_missing(error: Exception) -> bool:
     """Whether the bucket itself is missing; the filesystems have no error of its own for that."""
     return "bucket does not exist" in str(error).lower()
 

@@ -1,15 +1,13 @@
-"""The square window that scene and hypothesis patches are cut with."""
+"""The square crop window of scene and hypothesis patches."""
 
 from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 
 from posecore import se3
-
-Array = np.ndarray
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +24,7 @@ class Window:
     y0_px: float
     side_px: float
 
-    def as_array(self) -> Float[Array, "3"]:
+    def as_array(self) -> Float[np.ndarray, "3"]:
         """(x0, y0, side) in pixels, the form stored in shards."""
         return np.array([self.x0_px, self.y0_px, self.side_px])
 
@@ -37,8 +35,8 @@ def centred(u_px: float, v_px: float, side_px: float) -> Window:
 
 
 def silhouette_box(
-    vertices_m: Float[Array, "v 3"], K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"]
-) -> Float[Array, "4"]:
+    vertices_m: Float[np.ndarray, "v 3"], K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]
+) -> Float[np.ndarray, "4"]:
     """Bounding box (x0, y0, x1, y1) in pixels of the projected object, not clipped by the image.
 
     The silhouette's box is the box of the projected vertices, so nothing is rendered. Infinite in every direction
@@ -52,8 +50,8 @@ def silhouette_box(
 
 
 def fixed_side_px(
-    vertices_m: Float[Array, "v 3"],
-    K: Float[Array, "3 3"],
+    vertices_m: Float[np.ndarray, "v 3"],
+    K: Float[np.ndarray, "3 3"],
     distance_min_m: float,
     padding: float = 0.1,
     n_views: int = 256,
@@ -71,7 +69,10 @@ def fixed_side_px(
 
 
 def fixed_window(
-    vertices_m: Float[Array, "v 3"], K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], side_px: float
+    vertices_m: Float[np.ndarray, "v 3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    side_px: float,
 ) -> Window:
     """Window of fixed side centred on the box of the hypothesis' silhouette."""
     x0, y0, x1, y1 = silhouette_box(vertices_m, K, T_cam_obj)
@@ -79,9 +80,9 @@ def fixed_window(
 
 
 def diameter_window(
-    K: Float[Array, "3 3"],
-    T_cam_obj: Float[Array, "4 4"],
-    center_m: Float[Array, "3"],
+    K: Float[np.ndarray, "3 3"],
+    T_cam_obj: Float[np.ndarray, "4 4"],
+    center_m: Float[np.ndarray, "3"],
     diameter_m: float,
     scale: float = 1.5,
 ) -> Window:
@@ -102,13 +103,13 @@ def diameter_window(
 
 
 def cut(
-    image: Shaped[Array, "h w *c"],
+    image: Shaped[np.ndarray, "h w *c"],
     window: Window,
     patch_px: int,
     *,
     interpolation: Literal["linear", "area", "nearest"] = "linear",
     fill: float = 0.0,
-) -> Shaped[Array, "p p *c"]:
+) -> Shaped[np.ndarray, "p p *c"]:
     """Resample a window of the image to a square patch; outside the image the patch holds `fill`.
 
     "linear" samples at patch pixel centres; "area" first blurs when the patch is smaller than the window, so that
@@ -136,10 +137,29 @@ def cut(
     )
 
 
-def cut_rgb(image: UInt8[Array, "h w 3"], window: Window, patch_px: int) -> UInt8[Array, "p p 3"]:
-    """The scene patch of a window, antialiased, black outside the image; touches only the window's part of it."""
+def pixels_inside(window: Window, patch_px: int, width_px: int, height_px: int) -> Bool[np.ndarray, "p p"]:
+    """Mask of the patch pixels whose centres lie in the image."""
+    centre = (np.arange(patch_px) + 0.5) * window.side_px / patch_px
+    u, v = window.x0_px + centre, window.y0_px + centre
+    return ((v >= 0) & (v < height_px))[:, None] & ((u >= 0) & (u < width_px))[None]
+
+
+def cut_rgb(
+    image: UInt8[np.ndarray, "h w 3"], window: Window, patch_px: int, border: Literal["zero", "replicate"] = "zero"
+) -> UInt8[np.ndarray, "p p 3"]:
+    """The scene patch of a window, antialiased; reads only the window's part of the image.
+
+    Outside the image the patch is black, or with `replicate` continues the image's border, so that there is no edge.
+    """
     margin = 8 + int(2 * window.side_px / patch_px)
     x0, y0 = int(np.floor(window.x0_px)) - margin, int(np.floor(window.y0_px)) - margin
+    if border == "replicate":
+        size = int(np.ceil(window.side_px)) + 2 * margin + 1
+        columns = np.arange(x0, x0 + size).clip(0, image.shape[1] - 1)
+        rows = np.arange(y0, y0 + size).clip(0, image.shape[0] - 1)
+        padded = np.ascontiguousarray(image[rows[:, None], columns])
+        shifted = Window(x0_px=window.x0_px - x0, y0_px=window.y0_px - y0, side_px=window.side_px)
+        return np.asarray(cut(padded, shifted, patch_px, interpolation="area"))
     x1, y1 = int(x0 + window.side_px + 2 * margin + 2), int(y0 + window.side_px + 2 * margin + 2)
     x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, image.shape[1]), min(y1, image.shape[0])
     if x1 <= x0 or y1 <= y0:

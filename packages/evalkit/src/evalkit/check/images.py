@@ -186,7 +186,7 @@ def _check_masks(dataset: BopDataset, image: Image, size: Size, truths: list[Gro
         missing = []
         for truth in truths:
             try:
-                found = dataset.mask_and_place(*image, truth.gt_index, kind)
+                found = dataset.mask_and_location(*image, truth.gt_index, kind)
             except DatasetError as error:
                 findings.add_error("mask", error)
                 found_any = True

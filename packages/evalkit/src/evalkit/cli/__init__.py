@@ -1,23 +1,21 @@
 """The `evalkit` command: one module for each of its commands."""
 
-import logging
-
 import click
+from posecore.command_line import CONTEXT_SETTINGS, ErrorReportingGroup, renamed_options
 
 from evalkit import __version__
 from evalkit.cli.check import check
 from evalkit.cli.diff import diff
-from evalkit.cli.group import CleanGroup
 from evalkit.cli.perturb import perturb
 from evalkit.cli.report import report
 from evalkit.cli.tables import tables
 from evalkit.cli.tracking import tracking
 
 
-@click.group(cls=CleanGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=ErrorReportingGroup, context_settings=CONTEXT_SETTINGS)
 @click.version_option(__version__, prog_name="evalkit")
-@click.option("-v", "--verbose", is_flag=True, help="Log what is read and rendered.")
-def main(verbose: bool) -> None:
+@renamed_options({"-v": "--verbose after the command", "--verbose": "an option after the command"})
+def main() -> None:
     """Measure 6D poses against BOP ground truth.
 
     \b
@@ -25,7 +23,6 @@ def main(verbose: bool) -> None:
       evalkit perturb --dataset lmo --out results/start.csv --random-up-to 20
       evalkit report
     """
-    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="%(name)s: %(message)s")
 
 
 main.add_command(check)

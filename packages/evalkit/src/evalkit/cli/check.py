@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 
 
 @click.command()
@@ -13,11 +13,10 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option
 @click.argument("results", nargs=-1, type=FOLDER)
 @split_option
 @click.option("--sensor", help="Camera of several, such as cam1; rgb,gray1 where scenes differ.")
-@click.option(
-    "--samples", type=click.IntRange(0), default=100, show_default=True, help="Images to decode, spread evenly."
-)
+@click.option("--samples", type=click.IntRange(0), default=100, help="Images to decode, spread evenly.")
 @click.option("--all", "show_all", is_flag=True, help="List every violation. Default: the first 10 of each kind.")
 @click.option("--json", "json_file", type=NEW_FILE, metavar="FILE", help="Write the findings for programs.")
+@verbose_option
 @click.pass_context
 def check(
     ctx: click.Context,

@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, workers_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option, vss_option, workers_option
 
 RESULTS = click.Path(path_type=Path, dir_okay=False)
 
@@ -21,7 +21,6 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
     "--limit",
     type=click.FloatRange(0, min_open=True),
     default=0.1,
-    show_default=True,
     help="A pose fails with an ADD(-S) of so many diameters or more.",
 )
 @click.option(
@@ -32,10 +31,11 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
 @click.option("--json", "json_file", type=NEW_FILE, help="Write everything as JSON.")
 @click.option("--csv", "csv_file", type=NEW_FILE, help="Write a line for each pose.")
 @click.option("--html", "html_file", type=NEW_FILE, help="Write a page with pictures.")
-@click.option("--list", "listed", type=click.IntRange(0), default=10, show_default=True, help="Poses to list.")
-@click.option("--pictures", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of each kind.")
-@click.option("--resamples", type=click.IntRange(1), default=1000, show_default=True, help="Of the bootstrap.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the bootstrap.")
+@click.option("--list", "listed", type=click.IntRange(0), default=10, help="Poses to list.")
+@click.option("--pictures", type=click.IntRange(0, 200), default=12, help="Pictures of each kind.")
+@click.option("--resamples", type=click.IntRange(1), default=1000, help="Of the bootstrap.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Of the bootstrap.")
+@verbose_option
 def diff(
     a: Path,
     b: Path,

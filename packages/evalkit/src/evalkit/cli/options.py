@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from posecore import command_line
 
 
 class Numbers(click.ParamType):
@@ -23,18 +24,17 @@ class Numbers(click.ParamType):
 
 FOLDER = click.Path(path_type=Path)
 NEW_FILE = click.Path(path_type=Path, dir_okay=False)
+verbose_option = command_line.verbose_option("evalkit")
 split_option = click.option("--split", help="Split folder. Default: test, val, train_pbr, train or the only one.")
 vss_option = click.option(
     "--vss",
     type=click.Choice(["full", "visible"]),
     default="full",
-    show_default=True,
     help="Whole silhouettes, or their visible parts (needs depth images).",
 )
 workers_option = click.option(
     "--workers",
     type=click.IntRange(1),
     default=1,
-    show_default=True,
     help="Processes that score poses; the numbers do not depend on it.",
 )

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, Numbers, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, Numbers, split_option, verbose_option
 
 
 @click.command()
@@ -28,10 +28,10 @@ from evalkit.cli.options import FOLDER, NEW_FILE, Numbers, split_option
     "--depth-stretch",
     type=click.FloatRange(1, 20),
     default=1.0,
-    show_default=True,
     help="Factor on the random start's move along the viewing ray: detectors that see RGB alone err most in depth.",
 )
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all draws.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Seed of all draws.")
+@verbose_option
 def perturb(
     dataset: Path,
     out: Path,

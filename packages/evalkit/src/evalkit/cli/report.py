@@ -1,14 +1,14 @@
 """`evalkit report`."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from posecore.command_line import progress_bar
 
-from evalkit.cli.options import FOLDER, split_option, vss_option, workers_option
+from evalkit.cli.options import FOLDER, split_option, verbose_option, vss_option, workers_option
 
 
 @click.command()
@@ -16,11 +16,12 @@ from evalkit.cli.options import FOLDER, split_option, vss_option, workers_option
 @click.option(
     "--results", multiple=True, type=FOLDER, help="BOP result file; repeat it to compare. Default: all with a sidecar."
 )
-@click.option("--out", type=FOLDER, default=Path("report"), show_default=True, help="Folder for the report.")
+@click.option("--out", type=FOLDER, default=Path("report"), help="Folder for the report.")
 @split_option
 @vss_option
 @workers_option
-@click.option("--worst", type=click.IntRange(0, 200), default=12, show_default=True, help="Pictures of worst cases.")
+@click.option("--worst", type=click.IntRange(0, 200), default=12, help="Pictures of worst cases.")
+@verbose_option
 def report(
     dataset: Path | None,
     results: tuple[Path, ...],
@@ -49,7 +50,7 @@ def report(
     here = Path()
     paths = list(results) or find_result_files(here, dataset is not None)
     opened = BopDataset(dataset or dataset_of(paths, here), split)
-    with _progress() as progress:
+    with progress_bar(quiet=not sys.stderr.isatty()) as progress:
 
         def start(name: str, total: int) -> Callable[[int], None]:
             task = progress.add_task(name, total=total)
@@ -61,12 +62,6 @@ def report(
     for file in written.summary["files"]:
         click.echo(_total_line(file))
     click.echo(f"Report: {written.page}")
-
-
-def _progress() -> Progress:
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 def _total_line(file: dict[str, Any]) -> str:

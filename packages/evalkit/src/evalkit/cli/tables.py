@@ -5,7 +5,7 @@ from typing import Literal
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, workers_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option, vss_option, workers_option
 
 
 @click.command()
@@ -18,15 +18,13 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, vss_option, work
     "--by",
     type=click.Choice(["object", "scene"]),
     default="object",
-    show_default=True,
     help="What has a row of its own and is counted once in totals.",
 )
 @vss_option
 @workers_option
-@click.option(
-    "--resamples", type=click.IntRange(0), default=0, show_default=True, help="For 95 % intervals; 1000 are enough."
-)
+@click.option("--resamples", type=click.IntRange(0), default=0, help="For 95 % intervals; 1000 are enough.")
 @click.option("--out", multiple=True, type=NEW_FILE, help="Also write a file: .md, .tex, .csv or .json. Repeatable.")
+@verbose_option
 def tables(
     dataset: Path | None,
     results: tuple[Path, ...],

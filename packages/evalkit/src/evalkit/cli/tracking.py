@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from evalkit.cli.options import FOLDER, NEW_FILE, split_option
+from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 
 
 @click.command()
@@ -22,10 +22,10 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option
     "--resamples",
     type=click.IntRange(0),
     default=0,
-    show_default=True,
     help="For 95 % intervals of the means over sequences; 1000 are enough.",
 )
 @click.option("--out", multiple=True, type=NEW_FILE, help="Also write a file: .md, .tex, .csv or .json. Repeatable.")
+@verbose_option
 def tracking(
     dataset: Path | None,
     results: tuple[Path, ...],

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.errors import DatasetError, ResultFileError
 
 from evalkit.inputs.result_files import ResultFile
@@ -41,7 +41,7 @@ class Pairing:
     ignored: int
 
 
-def truths_of(dataset: BopDataset, target: Target) -> list[GroundTruth]:
+def truths_of(dataset: BopDataset, target: BopTarget) -> list[GroundTruth]:
     """Annotated instances of a target with a pose, the most visible first.
 
     Raises:
@@ -130,7 +130,7 @@ def _level(row: dict[str, Any]) -> Level | None:
 
 
 def _pair_starts(dataset: BopDataset, result: ResultFile, starts: Sequence[_Start]) -> Pairing:
-    """Every start with its estimate: by the sidecar's `start_lines`, else in order within image and object."""
+    """Every start with its estimate: by the sidecar's `initial_lines`, else in order within image and object."""
     estimates = _by_start_line(result, starts)
     pairs = []
     for start in starts:
@@ -147,11 +147,11 @@ def _pair_starts(dataset: BopDataset, result: ResultFile, starts: Sequence[_Star
 
 
 def _by_start_line(result: ResultFile, starts: Sequence[_Start]) -> dict[int, Estimate]:
-    lines = result.sidecar.get("start_lines")
+    lines = result.sidecar.get("initial_lines")
     if lines is not None:
         if not isinstance(lines, list) or len(lines) != len(result.estimates):
             raise ResultFileError(
-                f"{result.path}.json: 'start_lines' must hold one number for each of {len(result.estimates)} estimates"
+                f"{result.path}.json: 'initial_lines' must hold a number for each of {len(result.estimates)} estimates"
             )
         return {int(line): estimate for line, estimate in zip(lines, result.estimates, strict=True)}
     by_key = _by_key(result.estimates)
@@ -160,7 +160,7 @@ def _by_start_line(result: ResultFile, starts: Sequence[_Start]) -> dict[int, Es
         if len(by_key.get(key, [])) not in (0, count):
             raise ResultFileError(
                 f"{result.path}: {len(by_key[key])} estimates of object {key[2]} in scene {key[0]}, image {key[1]}, "
-                f"but {count} starts; write one line for each start, or 'start_lines' in the sidecar"
+                f"but {count} starts; write one line for each start, or 'initial_lines' in the sidecar"
             )
     queues = {key: iter(estimates) for key, estimates in by_key.items()}
     return {start.line: next(queues[start.key]) for start in starts if start.key in queues}

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from posecore import se3
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target, write_results
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth, write_results
 from posecore.errors import ConfigError
 
 from evalkit import __version__
 from evalkit.inputs.pairing import Level, truths_of
-from evalkit.inputs.result_files import START_METHOD
+from evalkit.inputs.result_files import INITIAL_METHOD
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ def perturb_dataset(
     sidecar = {
         "dataset": str(dataset.root.resolve()),
         "split": dataset.split,
-        "method": START_METHOD,
+        "method": INITIAL_METHOD,
         "settings": {"seed": seed, "depth_stretch": depth_stretch, "evalkit": __version__},
         "perturbation": ({} if protocol is None else {"protocol": protocol}) | {"rows": rows},
     }
@@ -139,7 +139,9 @@ def _drawn(limit: Level, rng: np.random.Generator) -> Level:
     )
 
 
-def _start(target: Target, truth: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator) -> Estimate:
+def _start(
+    target: BopTarget, truth: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator
+) -> Estimate:
     distance_m = level.translation_diameter * diameter_m
     return Estimate(
         scene_id=target.scene_id,
@@ -163,7 +165,7 @@ def _stretched(
     return replace(start, T_cam_obj=T), replace(level, translation_diameter=moved)
 
 
-def _sidecar_row(line: int, target: Target, truth: GroundTruth, level: Level) -> dict[str, Any]:
+def _sidecar_row(line: int, target: BopTarget, truth: GroundTruth, level: Level) -> dict[str, Any]:
     return {
         "line": line,
         "scene_id": target.scene_id,

@@ -13,7 +13,7 @@ from posecore.files import sha256_file
 
 log = logging.getLogger(__name__)
 
-START_METHOD = "start"
+INITIAL_METHOD = "initial"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +37,7 @@ class ResultFile:
     @property
     def is_start(self) -> bool:
         """Whether these are the poses that the other files started from."""
-        return self.sidecar.get("method") == START_METHOD
+        return self.sidecar.get("method") == INITIAL_METHOD
 
 
 def find_result_files(folder: Path, is_dataset_given: bool = False) -> list[Path]:

@@ -57,7 +57,7 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
 def _file_summary(
     item: Scored, distance_edges_m: Sequence[float], symmetries: Mapping[int, Float[Array, "_ 4 4"]]
 ) -> dict[str, Any]:
-    sidecar = {key: value for key, value in item.file.sidecar.items() if key not in ("perturbation", "start_lines")}
+    sidecar = {key: value for key, value in item.file.sidecar.items() if key not in ("perturbation", "initial_lines")}
     return {
         "name": item.file.name,
         "path": str(item.file.path),

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
-from posecore.bop import BopDataset, Estimate, GroundTruth, Target
+from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
@@ -146,13 +146,13 @@ def frames_of(
     return table, np.array(T_est).reshape(-1, 4, 4), np.array(T_gt).reshape(-1, 4, 4)
 
 
-def _every_pose(dataset: BopDataset) -> list[Target]:
+def _every_pose(dataset: BopDataset) -> list[BopTarget]:
     targets = []
     for scene_id in sorted({target.scene_id for target in dataset.targets}):
         for im_id in dataset.im_ids(scene_id):
             count = Counter(gt.obj_id for gt in dataset.gt(scene_id, im_id) if gt.has_pose)
             targets += [
-                Target(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=n) for obj_id, n in count.items()
+                BopTarget(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=n) for obj_id, n in count.items()
             ]
     return targets
 

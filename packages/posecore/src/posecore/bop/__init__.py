@@ -1,16 +1,16 @@
 """BOP datasets and result files: read and written, metres inside, millimetres in the files."""
 
-from posecore.bop.dataset import BopDataset, GroundTruth, Target
+from posecore.bop.dataset import BopDataset, BopTarget, GroundTruth
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
 from posecore.bop.results import (
     Estimate,
     ResultTable,
+    estimate_table,
     estimates_of,
     read_result_table,
     read_results,
     read_sidecar,
     sidecar_path,
-    table_of,
     write_results,
 )
 from posecore.bop.splits import splits_of
@@ -18,6 +18,7 @@ from posecore.bop.writer import (
     BopWriter,
     FrameEntry,
     FrameFiles,
+    FrameRecord,
     scene_folder,
     visible_targets,
     write_camera,
@@ -27,14 +28,16 @@ from posecore.bop.writer import (
 
 __all__ = [
     "BopDataset",
+    "BopTarget",
     "BopWriter",
     "Estimate",
     "FrameEntry",
     "FrameFiles",
+    "FrameRecord",
     "GroundTruth",
     "ModelInfo",
     "ResultTable",
-    "Target",
+    "estimate_table",
     "estimates_of",
     "load_models_info",
     "read_result_table",
@@ -44,7 +47,6 @@ __all__ = [
     "sidecar_path",
     "splits_of",
     "symmetry_transforms",
-    "table_of",
     "visible_targets",
     "write_camera",
     "write_models",

@@ -1,4 +1,4 @@
-"""What a BOP dataset says of an image: cameras, true poses and targets, in metres, checked as they are read."""
+"""Annotations of a BOP image: camera, ground truth and targets, in metres, checked while reading."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,6 @@ from posecore.bop.jsonfile import fraction, integer, numbers, shown
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 NO_POSE_MM = -1.0
 LARGEST_T_MM = 1e9
 LARGEST_DEPTH_SCALE = 1e6
@@ -19,27 +18,27 @@ LARGEST_DEPTH_SCALE = 1e6
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GroundTruth:
-    """One annotated object of one image.
+    """An annotated object in an image.
 
     Attributes:
         obj_id: object.
         T_cam_obj: (4, 4) pose, metres, as in the file (real annotations are orthonormal to about 0.01 only); all NaN
-            where BOP says there is no pose.
-        visib_fract: visible share of the silhouette in [0, 1], or None where `scene_gt_info.json` is missing.
+            where BOP marks the pose as unknown.
+        visib_fract: visible fraction of the silhouette in [0, 1], or None where `scene_gt_info.json` is missing.
         gt_index: position in the image's list, the number in mask file names.
         has_pose: False where BOP marks the pose as unknown (t = -1, -1, -1).
     """
 
     obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     visib_fract: float | None = None
     gt_index: int = 0
     has_pose: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, order=True)
-class Target:
-    """An object to be found in an image, `inst_count` times."""
+class BopTarget:
+    """An object of which `inst_count` instances are expected in an image (BOP's targets)."""
 
     scene_id: int
     im_id: int
@@ -47,7 +46,7 @@ class Target:
     inst_count: int = 1
 
 
-def camera_matrix(entry: Any, where: str) -> Float[Array, "3 3"]:
+def camera_matrix(entry: Any, where: str) -> Float[np.ndarray, "3 3"]:
     """The camera matrix of an entry of `scene_camera.json`: `cam_K`, or a `cam_model` that is a pinhole.
 
     Raises:
@@ -87,13 +86,13 @@ def ground_truth(entry: Any, index: int, visib_fract: float | None, where: str) 
 
 
 def visib_fract(entry: Any, where: str) -> float | None:
-    """Visible share of an object from its entry in `scene_gt_info.json`; None where it is not given.
+    """Visible fraction of an object from its entry in `scene_gt_info.json`; None where it is not given.
 
     Raises:
-        DatasetError: the entry is not one, or the share is not from 0 to 1; the message starts with `where`.
+        DatasetError: the entry is not one, or the fraction is not from 0 to 1; the message starts with `where`.
     """
     if not isinstance(entry, dict):
-        raise DatasetError(f"{where}: found a {type(entry).__name__}, expected the numbers of one object")
+        raise DatasetError(f"{where}: found a {type(entry).__name__}, expected an object with numbers")
     return fraction(entry, "visib_fract", where) if "visib_fract" in entry else None
 
 

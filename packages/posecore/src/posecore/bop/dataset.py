@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from posecore.bop.annotations import GroundTruth, Target, camera_matrix, depth_scale, ground_truth, visib_fract
+from posecore.bop.annotations import BopTarget, GroundTruth, camera_matrix, depth_scale, ground_truth, visib_fract
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import image_size, read_depth, read_rgb
 from posecore.bop.jsonfile import integer, read_json
@@ -20,13 +20,11 @@ from posecore.camera import Camera
 from posecore.errors import CameraError, DatasetError
 from posecore.mesh import Mesh, load_mesh
 
-__all__ = ["BopDataset", "GroundTruth", "Target"]
-
-Array = np.ndarray
+__all__ = ["BopDataset", "BopTarget", "GroundTruth"]
 
 
 class BopDataset:
-    """One split of a BOP dataset. Files are read when asked for; annotations of the scenes used last are kept."""
+    """One split of a BOP dataset. Files are read on demand; annotations of the last scenes are cached."""
 
     def __init__(self, root: str | Path, split: str | None = None, sensor: str | None = None) -> None:
         """Open a dataset folder.
@@ -66,7 +64,7 @@ class BopDataset:
         return isinstance(self._source, ShardSource)
 
     def scene_path(self, scene_id: int) -> Path:
-        """Folder of a scene; where scenes lie in tar files, the one it would be.
+        """Folder of a scene; it does not exist where scenes lie in tar files.
 
         Raises:
             DatasetError: there is no such scene.
@@ -84,7 +82,7 @@ class BopDataset:
         return self._source.files(scene_id)
 
     def forget(self, scene_id: int) -> None:
-        """Free what is kept in memory of a scene; it is read again when it is asked for."""
+        """Free a scene's annotations in memory; they are read again when they are needed."""
         self._source.forget(scene_id)
 
     def im_ids(self, scene_id: int) -> list[int]:
@@ -92,13 +90,13 @@ class BopDataset:
         return self._source.im_ids(scene_id, "gt" if self.has_gt(scene_id) else "camera")
 
     def annotation(self, scene_id: int, kind: Kind) -> str:
-        """Where a scene's entries of a kind are or would be, for errors."""
+        """Location of a scene's entries of a kind, for errors; it need not exist."""
         self._require(scene_id)
         return self._source.annotation(scene_id, kind)
 
-    def annotated_by(self, scene_id: int, of: Kind = "gt") -> str:
-        """What decides which images a scene has, in words for an error."""
-        if of == "gt" and self.has_gt(scene_id):
+    def annotated_by(self, scene_id: int, kind: Kind = "gt") -> str:
+        """Annotation that lists the images of a scene, for errors."""
+        if kind == "gt" and self.has_gt(scene_id):
             return f"ground truth in {self._source.annotation(scene_id, 'gt')}"
         return f"camera in {self._source.annotation(scene_id, 'camera')}"
 
@@ -108,7 +106,7 @@ class BopDataset:
         return self._source.has(scene_id, "gt")
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str] | None:
-        """What the files say of an image as it stands there, and where; None where the scene has none of this kind.
+        """Unparsed annotation of an image and its location for errors; None where the scene has none of this kind.
 
         Args:
             scene_id: scene.
@@ -127,8 +125,8 @@ class BopDataset:
         return self._source.im_ids(scene_id, kind) if self._source.has(scene_id, kind) else []
 
     @cached_property
-    def targets(self) -> list[Target]:
-        """What is to be found: the split's targets file (BOP19, else BOP24), else all ground truth with a pose.
+    def targets(self) -> list[BopTarget]:
+        """Objects to be estimated: the split's targets file (BOP19, else BOP24), else all ground truth with a pose.
 
         Targets without an object (BOP24 detection) are filled in from ground truth.
 
@@ -170,32 +168,32 @@ class BopDataset:
                 raise DatasetError(f"{where}: scene {scene_id} is not in {self.split_path}; download or remove it")
             yield entry, scene_id, im_id, where
 
-    def _listed_targets(self, file: Path) -> Iterator[Target]:
+    def _listed_targets(self, file: Path) -> Iterator[BopTarget]:
         seen: dict[tuple[int, int, int], str] = {}
         for entry, scene_id, im_id, where in self._target_entries(file):
             if "obj_id" not in entry:
                 yield from self._annotated_targets(scene_id, im_id)
                 continue
             count = integer(entry, "inst_count", where) if "inst_count" in entry else 1
-            target = Target(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
+            target = BopTarget(scene_id=scene_id, im_id=im_id, obj_id=integer(entry, "obj_id", where), inst_count=count)
             key = (scene_id, im_id, target.obj_id)
             if key in seen:  # its poses would be expected twice
-                raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one of them")
+                raise DatasetError(f"{where}: repeats the object of {seen[key]}; remove one")
             seen[key] = f"entry {where.rsplit(' ', 1)[-1]}"
             yield target
 
-    def _annotated_targets(self, scene_id: int, im_id: int) -> list[Target]:
-        found = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
+    def _annotated_targets(self, scene_id: int, im_id: int) -> list[BopTarget]:
+        annotated = [gt.obj_id for gt in self.gt(scene_id, im_id) if gt.has_pose]
         return [
-            Target(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=found.count(obj_id))
-            for obj_id in sorted(set(found))
+            BopTarget(scene_id=scene_id, im_id=im_id, obj_id=obj_id, inst_count=annotated.count(obj_id))
+            for obj_id in sorted(set(annotated))
         ]
 
     def camera(self, scene_id: int, im_id: int) -> Camera:
-        """Intrinsics of one image; its size is that of the image file, else the one in `camera.json`.
+        """Intrinsics of an image; the size is that of the image file, else that in `camera.json`.
 
         Raises:
-            DatasetError: the image has no camera, it is no pinhole, or its size is nowhere to be found.
+            DatasetError: the image has no camera, it is no pinhole, or its size is given nowhere.
         """
         self._require(scene_id)
         entry, where = self._source.entry(scene_id, im_id, "camera")
@@ -240,15 +238,7 @@ class BopDataset:
             raise DatasetError(f"{scene}: no image {im_id:06d} as png, jpg or tif in rgb/ or gray/")
         return file
 
-    def image_path(self, scene_id: int, im_id: int) -> Path:
-        """Where the colour (else gray) image lies; the tar file where it is in one.
-
-        Raises:
-            DatasetError: there is none.
-        """
-        return self.image_file(scene_id, im_id).path
-
-    def rgb(self, scene_id: int, im_id: int) -> UInt8[Array, "h w 3"]:
+    def rgb(self, scene_id: int, im_id: int) -> UInt8[np.ndarray, "h w 3"]:
         """The image in RGB; gray is repeated three times."""
         return read_rgb(self.image_file(scene_id, im_id))
 
@@ -257,7 +247,7 @@ class BopDataset:
         self._require(scene_id)
         return self._source.image(scene_id, im_id, "depth")
 
-    def depth_m(self, scene_id: int, im_id: int) -> Float[Array, "h w"] | None:
+    def depth_m(self, scene_id: int, im_id: int) -> Float[np.ndarray, "h w"] | None:
         """Camera z in metres, 0 where unknown; None where the image has no depth file.
 
         What is not finite or below 0 in a floating-point depth image counts as unknown.
@@ -279,7 +269,7 @@ class BopDataset:
         return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
 
     def depth_scale(self, scene_id: int, im_id: int) -> float:
-        """Millimetres for one step of the image's depth; 1 where the files do not say.
+        """Millimetres for one step of the image's depth; 1 where the files give none.
 
         Raises:
             DatasetError: it is not above 0.
@@ -287,19 +277,21 @@ class BopDataset:
         self._require(scene_id)
         return depth_scale(*self._source.entry(scene_id, im_id, "camera"))
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, *, visible: bool = False) -> Bool[Array, "h w"] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, *, visible: bool = False
+    ) -> Bool[np.ndarray, "h w"] | None:
         """Annotated silhouette of an object, whole or its visible part; None where the dataset has none.
 
         Raises:
             DatasetError: the mask is damaged.
         """
-        found = self.mask_and_place(scene_id, im_id, gt_index, "mask_visib" if visible else "mask")
-        return None if found is None else found[0]
+        located = self.mask_and_location(scene_id, im_id, gt_index, "mask_visib" if visible else "mask")
+        return None if located is None else located[0]
 
-    def mask_and_place(
+    def mask_and_location(
         self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
-    ) -> tuple[Bool[Array, "h w"], str] | None:
-        """As `mask`, with where it lies."""
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
+        """As `mask`, with the file that holds it, for errors."""
         self._require(scene_id)
         return self._source.mask(scene_id, im_id, gt_index, kind)
 
@@ -348,9 +340,9 @@ class BopDataset:
         They are `models`, then those of a type (`models_cad`) by name, then those for evaluation (`models_eval`);
         with `eval` these come first.
         """
-        found = sorted(path for path in self.root.glob("models*") if path.is_dir() and _is_models(path.name))
-        plain = [path for path in found if not path.name.endswith("_eval")]
-        simplified = [path for path in found if path.name.endswith("_eval")]
+        folders = sorted(path for path in self.root.glob("models*") if path.is_dir() and _is_models(path.name))
+        plain = [path for path in folders if not path.name.endswith("_eval")]
+        simplified = [path for path in folders if path.name.endswith("_eval")]
         return simplified + plain if eval else plain + simplified
 
     @property

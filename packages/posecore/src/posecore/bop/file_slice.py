@@ -1,4 +1,4 @@
-"""Bytes at rest: a file of its own, or a member of a tar file, read without unpacking."""
+"""A whole file or a byte range of a tar file, read without unpacking."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,13 +8,13 @@ from posecore.errors import DatasetError
 
 @dataclass(frozen=True, kw_only=True)
 class StoredFile:
-    """A file, or a part of one.
+    """A file, or a byte range in it.
 
     Attributes:
         path: the file on disk.
-        member: name inside the tar file, empty where the file is meant as a whole.
-        offset: where its bytes start.
-        size: how many there are; None for up to the end.
+        member: name inside the tar file, empty for a whole file.
+        offset: first byte.
+        size: number of bytes; None for up to the end.
     """
 
     path: Path
@@ -31,21 +31,21 @@ class StoredFile:
         return Path(self.member or self.path.name).suffix.lower()
 
     def read(self, limit: int | None = None) -> bytes:
-        """The bytes, or the first `limit` of them.
+        """All bytes, or the first `limit`.
 
         Raises:
             DatasetError: the file is missing, cannot be read or is shorter than it should be.
         """
-        wanted = self.size if limit is None or (self.size is not None and self.size < limit) else limit
+        size = self.size if limit is None or (self.size is not None and self.size < limit) else limit
         try:
             with self.path.open("rb") as stream:
                 stream.seek(self.offset)
-                data = stream.read() if wanted is None else stream.read(wanted)
+                data = stream.read() if size is None else stream.read(size)
         except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or str(error)
             raise DatasetError(f"{self}: cannot be read ({reason}); copy it again") from error
-        if self.member and wanted is not None and len(data) < wanted:
-            raise DatasetError(f"{self}: found {len(data)} of {wanted} bytes; the tar file is cut off, copy it again")
+        if self.member and size is not None and len(data) < size:
+            raise DatasetError(f"{self}: found {len(data)} of {size} bytes; the tar file is cut off, copy it again")
         return data
 
 

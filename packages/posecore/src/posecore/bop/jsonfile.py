@@ -1,4 +1,4 @@
-"""JSON of a BOP folder: read with the place of every error, written atomically."""
+"""JSON of a BOP folder: errors with their location, atomic writes."""
 
 import json
 import math
@@ -13,7 +13,6 @@ from jaxtyping import Float
 from posecore.errors import DatasetError
 from posecore.files import write_atomic
 
-Array = np.ndarray
 LARGEST_INTEGER = 2**63 - 1
 
 
@@ -37,11 +36,11 @@ def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
 
     Args:
         data: the file's bytes.
-        name: what errors call it.
+        name: of the file, for errors.
         kind: of the top level.
 
     Raises:
-        DatasetError: not UTF-8, invalid JSON (with line and column), a key that stands twice in one object, nested too
+        DatasetError: not UTF-8, invalid JSON (with line and column), a key that occurs twice in an object, nested too
             deep, a number with thousands of digits, another top level.
     """
 
@@ -50,7 +49,7 @@ def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
         if len(content) < len(pairs):  # the parser would keep the last one in silence
             keys = [key for key, _ in pairs]
             twice = next(key for key in keys if keys.count(key) > 1)
-            raise DatasetError(f"{name}: the key {shown(twice)} stands twice in one object; remove one of them")
+            raise DatasetError(f"{name}: the key {shown(twice)} occurs twice in an object; remove one")
         return content
 
     try:
@@ -89,7 +88,7 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def numbers(entry: Any, key: str, count: int, where: str) -> Float[Array, " n"]:
+def numbers(entry: Any, key: str, count: int, where: str) -> Float[np.ndarray, " n"]:
     """The `count` finite numbers under `entry[key]`: one number, a list, or a list of rows.
 
     Raises:
@@ -97,21 +96,21 @@ def numbers(entry: Any, key: str, count: int, where: str) -> Float[Array, " n"]:
     """
     if not isinstance(entry, dict) or key not in entry:
         raise DatasetError(f"{where}: has no '{key}', expected {count} numbers")
-    found = entry[key]
-    rows = found if isinstance(found, list) else [found]
+    content = entry[key]
+    rows = content if isinstance(content, list) else [content]
     values = [value for row in rows for value in (row if isinstance(row, list) else [row])]
     if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
-        raise DatasetError(f"{where}: '{key}' is {shown(found)}, expected {count} numbers")
+        raise DatasetError(f"{where}: '{key}' is {shown(content)}, expected {count} numbers")
     if len(values) != count:
         raise DatasetError(
-            f"{where}: '{key}' has {len(values)} numbers, {shown(found)}, expected {count} finite numbers"
+            f"{where}: '{key}' has {len(values)} numbers, {shown(content)}, expected {count} finite numbers"
         )
     try:
         array = np.array([float(value) for value in values], np.float64)
     except OverflowError as error:
-        raise DatasetError(f"{where}: '{key}' holds {shown(found)}, expected {count} finite numbers") from error
+        raise DatasetError(f"{where}: '{key}' holds {shown(content)}, expected {count} finite numbers") from error
     if not np.isfinite(array).all():
-        raise DatasetError(f"{where}: '{key}' holds {shown(found)}, expected {count} finite numbers")
+        raise DatasetError(f"{where}: '{key}' holds {shown(content)}, expected {count} finite numbers")
     return array
 
 
@@ -143,18 +142,18 @@ def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """The same mapping with its keys as integers.
 
     Raises:
-        DatasetError: a key is not a whole number from 0, or two of them are the same one (`7` and `007`).
+        DatasetError: a key is not a whole number from 0, or two keys are equal (`7` and `007`).
     """
-    found: dict[int, Any] = {}
+    by_id: dict[int, Any] = {}
     for key, value in content.items():
         if not (key.isascii() and key.isdigit()) or len(key) > 18:
             raise DatasetError(f"{file}: a key is not an integer ({shown(key)}), expected image or object ids")
-        if int(key) in found:
-            raise DatasetError(f"{file}: two keys mean {int(key)}, one of them {shown(key)}; remove one")
-        found[int(key)] = value
-    return found
+        if int(key) in by_id:
+            raise DatasetError(f"{file}: two keys mean {int(key)}, such as {shown(key)}; remove one")
+        by_id[int(key)] = value
+    return by_id
 
 
-def as_list(values: Sequence[float] | Float[Array, "..."]) -> list[float]:
+def as_list(values: Sequence[float] | Float[np.ndarray, "..."]) -> list[float]:
     """Plain floats for JSON, row by row."""
     return [float(value) for value in np.asarray(values, dtype=np.float64).reshape(-1)]

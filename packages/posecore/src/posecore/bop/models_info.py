@@ -22,7 +22,6 @@ __all__ = [
     "symmetry_transforms",
 ]
 
-Array = np.ndarray
 MM = 1e-3
 LARGEST_MM = 1e6
 """No length in `models_info.json` is larger: a kilometre."""
@@ -32,7 +31,7 @@ ROTATION_TOLERANCE = 2e-2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ModelInfo:
-    """What `models_info.json` says of one object.
+    """An object's entry in `models_info.json`.
 
     Attributes:
         diameter_m: largest distance between two vertices, metres.
@@ -41,7 +40,7 @@ class ModelInfo:
     """
 
     diameter_m: float
-    symmetries_discrete: tuple[Float[Array, "4 4"], ...] = ()
+    symmetries_discrete: tuple[Float[np.ndarray, "4 4"], ...] = ()
     symmetries_continuous: tuple[ContinuousSymmetry, ...] = ()
 
     @property
@@ -65,7 +64,7 @@ def load_models_info(path: str | Path) -> dict[int, ModelInfo]:
 
 
 def load_model_info(entry: Any, where: str) -> ModelInfo:
-    """Read one object's entry of `models_info.json`, in metres.
+    """Read an object's entry of `models_info.json`, in metres.
 
     Raises:
         DatasetError: as `load_models_info`; the message starts with `where`.
@@ -89,7 +88,7 @@ def _listed(entry: dict[str, Any], key: str, where: str) -> list[Any]:
     return items
 
 
-def _discrete(item: Any, where: str) -> Float[Array, "4 4"]:
+def _discrete(item: Any, where: str) -> Float[np.ndarray, "4 4"]:
     T = numbers({"symmetries_discrete": item}, "symmetries_discrete", 16, where).reshape(4, 4).copy()
     is_rigid = np.abs(T).max() <= LARGEST_MM and bool(se3.is_rotation(T[:3, :3], ROTATION_TOLERANCE))
     if not is_rigid or not np.allclose(T[3], [0, 0, 0, 1]):

@@ -1,4 +1,4 @@
-"""Result files as columns: a million lines in seconds, and the exact line and field of everything that is wrong."""
+"""Result files as columns: a million lines in seconds; each fault with its line and field."""
 
 import math
 import warnings
@@ -12,28 +12,27 @@ from posecore import se3
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import ResultFileError
 
-Array = np.ndarray
 COLUMNS = ("scene_id", "im_id", "obj_id", "score", "R", "t", "time")
 HEADER = ",".join(COLUMNS)
 COUNTS = {"R": 9, "t": 3}
-"""Numbers in a column's field, where it is not one."""
+"""Numbers in a field of these columns; 1 in the others."""
 LARGEST_T_MM = 1e9
 CHUNK_BYTES = 1 << 23
 _IDS = COLUMNS[:3]
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _PLAIN = b"0123456789+-.eE, \n"
-"""What a line of plain decimal numbers is made of. Lines with anything else are read one by one."""
+"""Characters of plain decimal numbers. Lines with any other are parsed one by one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineFault:
-    """What is wrong in one line of a result file.
+    """A fault in a line of a result file.
 
     Attributes:
         line: from 1; 0 where it is the file as a whole.
         field: column, or "line".
         kind: short name of the rule that is broken.
-        message: what was found and what is expected, without the place.
+        message: found and expected value, without the location.
     """
 
     line: int
@@ -56,18 +55,18 @@ class ResultTable:
         line: line in the file, from 1; 0 where it comes from elsewhere.
     """
 
-    scene_id: Int[Array, " n"]
-    im_id: Int[Array, " n"]
-    obj_id: Int[Array, " n"]
-    score: Float[Array, " n"]
-    T_cam_obj: Float[Array, "n 4 4"]
-    time_s: Float[Array, " n"]
-    line: Int[Array, " n"]
+    scene_id: Int[np.ndarray, " n"]
+    im_id: Int[np.ndarray, " n"]
+    obj_id: Int[np.ndarray, " n"]
+    score: Float[np.ndarray, " n"]
+    T_cam_obj: Float[np.ndarray, "n 4 4"]
+    time_s: Float[np.ndarray, " n"]
+    line: Int[np.ndarray, " n"]
 
     def __len__(self) -> int:
         return len(self.scene_id)
 
-    def take(self, index: Int[Array, " m"] | Bool[Array, " n"]) -> "ResultTable":
+    def take(self, index: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "ResultTable":
         """The estimates at these positions, or where a mask is true."""
         return ResultTable(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
@@ -87,8 +86,8 @@ def parse_results(data: bytes, name: str, on_fault: Callable[[LineFault], None] 
 
     Args:
         data: the file; translations in millimetres.
-        name: what errors call it.
-        on_fault: is told every fault, in the file's order; faulty lines are left out. Without it the first one raises.
+        name: of the file, for errors.
+        on_fault: called with every fault, in the file's order; faulty lines are left out. By default the first raises.
 
     Raises:
         ResultFileError: the file is empty or not UTF-8, its header is unknown; or, without `on_fault`, a line breaks
@@ -125,7 +124,9 @@ def parse_results(data: bytes, name: str, on_fault: Callable[[LineFault], None] 
     return ResultTable.concat(parts)
 
 
-def _table(ids: Int[Array, "n 3"], numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> ResultTable:
+def _table(
+    ids: Int[np.ndarray, "n 3"], numbers: Float[np.ndarray, "n 14"], lines: Int[np.ndarray, " n"]
+) -> ResultTable:
     return ResultTable(
         scene_id=np.ascontiguousarray(ids[:, 0]),
         im_id=np.ascontiguousarray(ids[:, 1]),
@@ -146,7 +147,7 @@ def _text(data: bytes, name: str, offset: int) -> str:
 
 
 def _header(body: bytes, name: str, offset: int) -> tuple[tuple[str, ...] | None, int, int]:
-    """Order of the columns if it is named, where the estimates start, and the line number there."""
+    """Order of the columns if it is named, and offset and line number of the first estimate."""
     start, line = 0, 1
     while True:  # up to the first line that is not blank; there is one
         end = body.find(b"\n", start)
@@ -178,8 +179,10 @@ def _chunks(body: bytes, start: int) -> Iterator[tuple[bytes, int]]:
         start = end
 
 
-def _plain_numbers(chunk: bytes, order: tuple[str, ...]) -> tuple[Int[Array, "n 3"], Float[Array, "n 14"]] | None:
-    """Ids and numbers of lines that hold what they should, all at once; None where any may not."""
+def _plain_numbers(
+    chunk: bytes, order: tuple[str, ...]
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 14"]] | None:
+    """Ids and numbers of well-formed lines, parsed at once; None if any line may be malformed."""
     plain = chunk.replace(b"\r\n", b"\n")
     if plain.translate(None, _PLAIN):
         return None
@@ -217,7 +220,7 @@ def _plain_numbers(chunk: bytes, order: tuple[str, ...]) -> tuple[Int[Array, "n 
 
 def _line_by_line(
     text: str, order: tuple[str, ...], first_line: int
-) -> tuple[Int[Array, "n 3"], Float[Array, "n 14"], Int[Array, " n"], list[LineFault]]:
+) -> tuple[Int[np.ndarray, "n 3"], Float[np.ndarray, "n 14"], Int[np.ndarray, " n"], list[LineFault]]:
     ids: list[list[int]] = []
     numbers: list[list[float]] = []
     lines: list[int] = []
@@ -233,19 +236,19 @@ def _line_by_line(
             faults.append(LineFault(line=number, field="line", kind="fields", message=message))
             continue
         by_name = dict(zip(order, parts, strict=True))
-        found: dict[str, list[float]] = {}
+        values: dict[str, list[float]] = {}
         id_values: list[int] = []
         for column in COLUMNS:
             try:
                 if column in _IDS:
                     id_values.append(_id(by_name[column], column))
                 else:
-                    found[column] = _floats(by_name[column], COUNTS.get(column, 1), column)
+                    values[column] = _floats(by_name[column], COUNTS.get(column, 1), column)
             except ResultFileError as error:
                 faults.append(LineFault(line=number, field=column, kind="format", message=str(error)))
         if len(faults) == wrong:
             ids.append(id_values)
-            numbers.append([value for column in COLUMNS[3:] for value in found[column]])
+            numbers.append([value for column in COLUMNS[3:] for value in values[column]])
             lines.append(number)
     n = len(lines)
     return (
@@ -278,8 +281,10 @@ def _floats(text: str, count: int, column: str) -> list[float]:
     return values
 
 
-def _valid(numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> tuple[Bool[Array, " n"], list[LineFault]]:
-    """Which lines hold finite numbers, a rotation and a possible translation, and what is wrong in the others."""
+def _valid(
+    numbers: Float[np.ndarray, "n 14"], lines: Int[np.ndarray, " n"]
+) -> tuple[Bool[np.ndarray, " n"], list[LineFault]]:
+    """Mask of the lines with finite numbers, a rotation and a plausible translation, and the others' faults."""
     finite = np.isfinite(numbers)
     good = finite.all(axis=1)
     faults = []
@@ -301,7 +306,7 @@ def _valid(numbers: Float[Array, "n 14"], lines: Int[Array, " n"]) -> tuple[Bool
     return good & ~far & ~improper, faults
 
 
-def _improper(R: Float[Array, "3 3"]) -> str:
+def _improper(R: Float[np.ndarray, "3 3"]) -> str:
     with np.errstate(over="ignore", invalid="ignore"):
         determinant = float(np.linalg.det(R))
         scale = math.copysign(abs(determinant) ** (1 / 3), determinant) if math.isfinite(determinant) else math.nan

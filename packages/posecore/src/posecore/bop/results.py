@@ -15,11 +15,13 @@ from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
 from posecore.errors import ResultFileError
 from posecore.files import write_atomic
+from posecore.renamed import migrated_keys
 
 __all__ = [
     "Estimate",
     "LineFault",
     "ResultTable",
+    "estimate_table",
     "estimates_of",
     "metres_fault",
     "read_result_bytes",
@@ -27,13 +29,18 @@ __all__ = [
     "read_results",
     "read_sidecar",
     "sidecar_path",
-    "table_of",
     "unknown_ids",
     "write_results",
 ]
 
-Array = np.ndarray
 SUSPICIOUS_DISTANCE_MM = 10.0
+RENAMED = {
+    "start_lines": "initial_lines",
+    "method=start": "method=initial",
+    "settings.sure": "settings.tracking_threshold",
+    "settings.found": "settings.reacquire_threshold",
+}
+"""Sidecar keys and values of version 0.1 by name, see `posecore.renamed`."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,29 +61,29 @@ class Estimate:
     im_id: int
     obj_id: int
     score: float = 1.0
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     time_s: float = -1.0
     line: int = 0
 
 
 def read_results(
-    path: str | Path, dataset: BopDataset | None = None, *, of: Literal["gt", "camera"] = "gt"
+    path: str | Path, dataset: BopDataset | None = None, *, images: Literal["gt", "camera"] = "gt"
 ) -> list[Estimate]:
     """Read a result file as a list; `read_result_table` gives the same as columns, which is faster.
 
     Args:
         path: CSV file; translations in millimetres.
-        dataset: where given, scenes, images and objects that it does not have are errors.
-        of: which images it has, see `unknown_ids`.
+        dataset: if given, unknown scenes, images and objects are errors.
+        images: images that are known, see `unknown_ids`.
 
     Raises:
         ResultFileError: as `read_result_table`.
     """
-    return estimates_of(read_result_table(path, dataset, of=of))
+    return estimates_of(read_result_table(path, dataset, images=images))
 
 
 def read_result_table(
-    path: str | Path, dataset: BopDataset | None = None, *, of: Literal["gt", "camera"] = "gt"
+    path: str | Path, dataset: BopDataset | None = None, *, images: Literal["gt", "camera"] = "gt"
 ) -> ResultTable:
     """Read a result file as columns. A file with a header and nothing else has no estimates.
 
@@ -85,8 +92,8 @@ def read_result_table(
 
     Args:
         path: CSV file; translations in millimetres.
-        dataset: where given, scenes, images and objects that it does not have are errors.
-        of: which images it has, see `unknown_ids`.
+        dataset: if given, unknown scenes, images and objects are errors.
+        images: images that are known, see `unknown_ids`.
 
     Raises:
         ResultFileError: missing or empty file, a line that breaks the format, NaN, a scaled or mirrored rotation, an
@@ -98,7 +105,7 @@ def read_result_table(
     if metres is not None:
         raise ResultFileError(f"{file}:{metres.line}: {metres.message}")
     if dataset is not None:
-        unknown = min(unknown_ids(table, dataset, of), key=lambda fault: fault.line, default=None)
+        unknown = min(unknown_ids(table, dataset, images), key=lambda fault: fault.line, default=None)
         if unknown is not None:
             raise ResultFileError(f"{file}:{unknown.line}: {unknown.message}")
     return table
@@ -128,7 +135,7 @@ def estimates_of(table: ResultTable) -> list[Estimate]:
     ]
 
 
-def table_of(estimates: Sequence[Estimate]) -> ResultTable:
+def estimate_table(estimates: Sequence[Estimate]) -> ResultTable:
     """Estimates as columns."""
     return ResultTable(
         scene_id=np.array([estimate.scene_id for estimate in estimates], np.int64),
@@ -142,30 +149,30 @@ def table_of(estimates: Sequence[Estimate]) -> ResultTable:
 
 
 def metres_fault(table: ResultTable) -> LineFault | None:
-    """What says that a file's translations are in metres, or None."""
+    """Fault if a file's translations are probably in metres, else None."""
     if not len(table):
         return None
     median_mm = float(np.median(np.abs(table.T_cam_obj[:, 2, 3]))) / MM
     if median_mm >= SUSPICIOUS_DISTANCE_MM:
         return None
     message = (
-        f"the median t_z of the file is {median_mm:.4g}, which looks like metres; "
+        f"the median t_z of the file is {median_mm:.4g}, probably in metres; "
         "BOP result files hold millimetres, multiply t by 1000"
     )
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
 
 
-def unknown_ids(table: ResultTable, dataset: BopDataset, of: Literal["gt", "camera"] = "gt") -> list[LineFault]:
-    """Lines whose scene, image or object the dataset does not have; the first of the three is named.
+def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "camera"] = "gt") -> list[LineFault]:
+    """Lines with a scene, image or object that the dataset does not have; the first of the three is reported.
 
     Args:
-        table: Lines.
-        dataset: What they are of.
-        of: Which images count: the annotated ones where a scene has ground truth, or all that have a camera.
+        table: Result file.
+        dataset: Its dataset.
+        images: `gt`: only annotated images where a scene has ground truth; `camera`: all images with a camera.
     """
     faults: dict[int, LineFault] = {}
 
-    def note(wrong: Bool[Array, " n"], field: str, message: Callable[[int], str]) -> None:
+    def note(wrong: Bool[np.ndarray, " n"], field: str, message: Callable[[int], str]) -> None:
         for index in np.flatnonzero(wrong).tolist():
             fault = LineFault(line=int(table.line[index]), field=field, kind="unknown id", message=message(index))
             faults.setdefault(index, fault)
@@ -179,18 +186,18 @@ def unknown_ids(table: ResultTable, dataset: BopDataset, of: Literal["gt", "came
     for number, scene_id in enumerate(scenes.tolist()):
         if not strange[number]:
             here = by_scene[bounds[number] : bounds[number + 1]]
-            known_ids = dataset.im_ids(scene_id) if of == "gt" else dataset.annotated_im_ids(scene_id, "camera")
+            known_ids = dataset.im_ids(scene_id) if images == "gt" else dataset.annotated_im_ids(scene_id, "camera")
             nowhere[here] = ~np.isin(table.im_id[here], sorted(known_ids))
     note(
         nowhere,
         "im_id",
-        lambda i: f"image {table.im_id[i]} has no {dataset.annotated_by(int(table.scene_id[i]), of)}",
+        lambda i: f"image {table.im_id[i]} has no {dataset.annotated_by(int(table.scene_id[i]), images)}",
     )
-    known = ", ".join(map(str, dataset.obj_ids))
+    listed = ", ".join(map(str, dataset.obj_ids))
     note(
         ~np.isin(table.obj_id, dataset.obj_ids),
         "obj_id",
-        lambda i: f"object {table.obj_id[i]} is unknown, {dataset.name} has {known}",
+        lambda i: f"object {table.obj_id[i]} is unknown, {dataset.name} has {listed}",
     )
     return [faults[index] for index in sorted(faults)]
 
@@ -202,7 +209,9 @@ def sidecar_path(path: str | Path) -> Path:
 
 
 def read_sidecar(path: str | Path) -> dict[str, Any] | None:
-    """What a result file's sidecar says (dataset, method, settings), or None where there is none.
+    """Content of a result file's sidecar (dataset, method, settings), or None where there is none.
+
+    Sidecars of earlier versions have the names of this one.
 
     Raises:
         DatasetError: the sidecar is not valid JSON; the message names file, line and column.
@@ -211,7 +220,7 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
     if not file.is_file():
         return None
     content: dict[str, Any] = read_json(file)
-    return content
+    return migrated_keys(content, RENAMED)
 
 
 def write_results(path: str | Path, estimates: Sequence[Estimate], sidecar: dict[str, Any] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""Where the annotations and images of a BOP split lie: scene folders, of one sensor or several."""
+"""Files of a BOP split's annotations and images: scene folders, for a single sensor or several."""
 
 import os
 import re
@@ -15,7 +15,6 @@ from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS, find_image,
 from posecore.bop.jsonfile import integer_keys, parse_json
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 Kind = Literal["camera", "gt", "gt_info"]
 Layer = Literal["colour", "depth"]
 MaskKind = Literal["mask", "mask_visib"]
@@ -26,7 +25,7 @@ _CAMERA_FILE = re.compile(r"scene_camera(?:_(.+))?\.json")
 
 @runtime_checkable
 class Source(Protocol):
-    """Annotations and images of one split. Errors are DatasetErrors that name file and image."""
+    """Annotations and images of a split. Errors are DatasetErrors that name file and image."""
 
     scene_ids: list[int]
 
@@ -39,19 +38,21 @@ class Source(Protocol):
         ...
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str]:
-        """What is annotated of an image, and where that stands."""
+        """Annotation of an image, and its location for errors."""
         ...
 
     def annotation(self, scene_id: int, kind: Kind) -> str:
-        """Where a scene's entries of this kind are or would be, for errors."""
+        """Location of a scene's entries of this kind, for errors; it need not exist."""
         ...
 
     def image(self, scene_id: int, im_id: int, layer: Layer) -> StoredFile | None:
         """The image file, or None where there is none."""
         ...
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
-        """An annotated silhouette and where it lies, or None where there is none."""
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
+        """An annotated silhouette and its file, or None where there is none."""
         ...
 
     def scene_path(self, scene_id: int) -> Path:
@@ -63,12 +64,12 @@ class Source(Protocol):
         ...
 
     def forget(self, scene_id: int) -> None:
-        """Free what is kept in memory of a scene."""
+        """Free a scene's annotations in memory."""
         ...
 
 
 class FolderSource:
-    """Scene folders (`000001/scene_camera.json`, `rgb/`, `depth/`), or one sensor's part of them.
+    """Scene folders (`000001/scene_camera.json`, `rgb/`, `depth/`), or the files of a single sensor in these.
 
     With several sensors, annotations and image folders carry the sensor's name: `scene_camera_cam1.json`,
     `rgb_cam1/`, `mask_visib_cam1/`; in HOT3D the image folder is the name itself (`scene_gt_gray1.json`, `gray1/`).
@@ -80,8 +81,8 @@ class FolderSource:
         Args:
             split_path: folder of the split.
             scenes: scene folders, and the sensors that each has, as `scenes_of` gives them.
-            sensors: wanted, the preferred one first; a scene with none of them is left out. The empty name stands for
-                files without a sensor's name.
+            sensors: sensors by preference; a scene without any is left out. The empty name stands for files without
+                a sensor's name.
 
         Raises:
             DatasetError: two folders are the same scene.
@@ -89,13 +90,13 @@ class FolderSource:
         self.split_path = split_path
         self._paths: dict[int, Path] = {}
         self._sensors: dict[int, str] = {}
-        for scene, there in scenes.items():
-            chosen = [sensor for sensor in sensors if sensor in there]
+        for scene, available in scenes.items():
+            chosen = [sensor for sensor in sensors if sensor in available]
             if not chosen:
                 continue
             number = int(scene.name)
             if number in self._paths:
-                raise DatasetError(f"{scene}: is scene {number} as {self._paths[number].name} is; remove one of them")
+                raise DatasetError(f"{scene}: is scene {number} as {self._paths[number].name} is; remove one")
             self._paths[number], self._sensors[number] = scene, chosen[0]
         self.scene_ids = sorted(self._paths)
         self._kept: OrderedDict[tuple[int, Kind], tuple[dict[int, Any], int]] = OrderedDict()
@@ -130,7 +131,7 @@ class FolderSource:
         return sorted(self._content(scene_id, kind))
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str]:
-        """Value of one key."""
+        """Value of the image's key."""
         content, file = self._content(scene_id, kind), self._file(scene_id, kind)
         if im_id not in content:
             raise DatasetError(f"{file}: no entry for image {im_id}; there are {some(sorted(content))}")
@@ -170,7 +171,9 @@ class FolderSource:
         path = find_image(tuple(folders), f"{im_id:06d}", extensions)
         return None if path is None else StoredFile(path=path)
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """The mask's PNG."""
         folder = self._paths[scene_id] / self._named(scene_id, kind)
         path = find_image((folder,), f"{im_id:06d}_{gt_index:06d}", ("png",))
@@ -207,8 +210,8 @@ def _sensors_of(scene: Path) -> frozenset[str]:
         names = os.listdir(scene)
     except OSError as error:
         raise DatasetError(f"{scene}: cannot be listed ({error.strerror}); change its rights") from error
-    found = (_CAMERA_FILE.fullmatch(name) for name in names)
-    return frozenset(match[1] or "" for match in found if match)
+    matches = (_CAMERA_FILE.fullmatch(name) for name in names)
+    return frozenset(match[1] or "" for match in matches if match)
 
 
 def some(ids: list[int], limit: int = 8) -> str:

@@ -1,4 +1,4 @@
-"""Which split of a dataset folder is meant, and how it is stored: scene folders of some sensor, or shards."""
+"""Choice of a dataset's split and of its storage: scene folders of a sensor, or shards."""
 
 from pathlib import Path
 
@@ -30,18 +30,18 @@ def open_source(split_path: Path, sensor: str | None) -> tuple[Source, tuple[str
         if sensor:
             raise DatasetError(f"{split_path}: no sensor '{sensor}', tar files have only one; leave the sensor out")
         return ShardSource(split_path), ()
-    counts = {name: sum(name in there for there in scenes.values()) for name in sensors}
+    counts = {name: sum(name in available for available in scenes.values()) for name in sensors}
     listed = ", ".join(f"{name or 'one without a name'} in {count} scene(s)" for name, count in counts.items())
     if sensor is None:
         if "" not in sensors and len(sensors) > 1:
-            raise DatasetError(f"{split_path}: several sensors ({listed}); say which one with --sensor")
-        wanted = ["" if "" in sensors else sensors[0]]
+            raise DatasetError(f"{split_path}: several sensors ({listed}); choose one with --sensor")
+        chosen = ["" if "" in sensors else sensors[0]]
     else:
-        wanted = [name.strip() for name in sensor.split(",")]
-    for name in wanted:
+        chosen = [name.strip() for name in sensor.split(",")]
+    for name in chosen:
         if name not in sensors:
             raise DatasetError(f"{split_path}: no sensor '{name}'; there are {listed}")
-    return FolderSource(split_path, scenes, wanted), tuple(name for name in wanted if name)
+    return FolderSource(split_path, scenes, chosen), tuple(name for name in chosen if name)
 
 
 def _is_split(folder: Path) -> bool:
@@ -54,7 +54,7 @@ def splits_of(root: str | Path) -> list[str]:
 
 
 def choose_split(root: Path) -> str:
-    """The split that is meant where none is named; "." for shards without a split folder.
+    """The default split; "." for shards without a split folder.
 
     Raises:
         DatasetError: there is none, or several and none preferred.
@@ -65,7 +65,7 @@ def choose_split(root: Path) -> str:
         if name in splits or len(typed) == 1:
             return name if name in splits else typed[0]
         if len(typed) > 1:
-            raise DatasetError(f"{root}: several splits ({', '.join(splits)}); say which one with --split")
+            raise DatasetError(f"{root}: several splits ({', '.join(splits)}); choose one with --split")
     if len(splits) == 1:
         return splits[0]
     if not splits and shard_files(root):
@@ -73,4 +73,4 @@ def choose_split(root: Path) -> str:
     if not splits:
         hint = "; this is a split folder, give the one above" if _is_split(root) else ""
         raise DatasetError(f"{root}: no split with scenes (test/000001/scene_camera.json, ...) in it{hint}")
-    raise DatasetError(f"{root}: several splits ({', '.join(splits)}); say which one with --split")
+    raise DatasetError(f"{root}: several splits ({', '.join(splits)}); choose one with --split")

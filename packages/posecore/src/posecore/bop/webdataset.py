@@ -1,4 +1,4 @@
-"""BOP in webdataset shards: tar files with `KEY.rgb.jpg`, `KEY.camera.json`, read where they lie without unpacking.
+"""BOP in webdataset shards: tar files with `KEY.rgb.jpg`, `KEY.camera.json`, read without unpacking.
 
 KEY is SCENE_IMAGE (`000001_000023`), as bop_toolkit writes it. Masks are run lengths in `KEY.mask_visib.json`.
 """
@@ -18,11 +18,10 @@ from posecore.bop.jsonfile import integer, integer_keys, parse_json, shown
 from posecore.bop.sources import Kind, Layer, MaskKind, some
 from posecore.errors import DatasetError
 
-Array = np.ndarray
 BLOCK = 512
 LARGEST_MASK_PX = 1 << 28
 _KEY = re.compile(r"([0-9]{1,18})_([0-9]{1,18})")
-_Place = tuple[int, str, int, int]  # shard, member's name, offset, size
+_Member = tuple[int, str, int, int]  # shard, member's name, offset, size
 
 
 def shard_files(folder: Path) -> list[Path]:
@@ -31,7 +30,7 @@ def shard_files(folder: Path) -> list[Path]:
 
 
 class ShardSource:
-    """A split in tar files. Their index is read once; images and annotations when they are asked for."""
+    """A split in tar files. Their index is read once; images and annotations on demand."""
 
     def __init__(self, split_path: Path) -> None:
         """Index the shards.
@@ -40,11 +39,11 @@ class ShardSource:
             split_path: folder with the tar files.
 
         Raises:
-            DatasetError: a shard is cut off or no tar file, or a member is there twice or of no image.
+            DatasetError: a shard is cut off or no tar file, or a member occurs twice or belongs to no image.
         """
         self.split_path = split_path
         self.shards = shard_files(split_path)
-        self._index: dict[int, dict[int, dict[str, _Place]]] = {}
+        self._index: dict[int, dict[int, dict[str, _Member]]] = {}
         for number, shard in enumerate(self.shards):
             for name, offset, size in _members(shard):
                 self._add(number, name, offset, size)
@@ -61,19 +60,19 @@ class ShardSource:
         if extension in image:
             other = image[extension]
             raise DatasetError(
-                f"{self.shards[shard]}:{name}: is in {self.shards[other[0]].name} as {other[1]} too; remove one of them"
+                f"{self.shards[shard]}:{name}: is in {self.shards[other[0]].name} as {other[1]} too; remove one"
             )
         image[extension] = shard, name, offset, size
 
     def scene_path(self, scene_id: int) -> Path:
-        """Where the scene would be if it were unpacked."""
+        """Folder of the scene if it were unpacked."""
         return self.split_path / f"{scene_id:06d}"
 
     def _stored(self, scene_id: int, im_id: int, extension: str) -> StoredFile | None:
-        place = self._index.get(scene_id, {}).get(im_id, {}).get(extension)
-        if place is None:
+        located = self._index.get(scene_id, {}).get(im_id, {}).get(extension)
+        if located is None:
             return None
-        shard, name, offset, size = place
+        shard, name, offset, size = located
         return StoredFile(path=self.shards[shard], member=name, offset=offset, size=size)
 
     def im_ids(self, scene_id: int, kind: Kind) -> list[int]:
@@ -90,11 +89,11 @@ class ShardSource:
 
     def files(self, scene_id: int) -> list[Path]:
         """The shards that hold a part of the scene."""
-        places = [place for image in self._index[scene_id].values() for place in image.values()]
-        return [self.shards[number] for number in sorted({place[0] for place in places})]
+        numbers = {member[0] for image in self._index[scene_id].values() for member in image.values()}
+        return [self.shards[number] for number in sorted(numbers)]
 
     def entry(self, scene_id: int, im_id: int, kind: Kind) -> tuple[Any, str]:
-        """Content of one member."""
+        """Content of the image's member."""
         file = self._stored(scene_id, im_id, f"{kind}.json")
         if file is None:
             there = some(self.im_ids(scene_id, kind))
@@ -111,7 +110,9 @@ class ShardSource:
         choices = (self._stored(scene_id, im_id, f"{name}.{ending}") for name in names for ending in extensions)
         return next((file for file in choices if file is not None), None)
 
-    def mask(self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind) -> tuple[Bool[Array, "h w"], str] | None:
+    def mask(
+        self, scene_id: int, im_id: int, gt_index: int, kind: MaskKind
+    ) -> tuple[Bool[np.ndarray, "h w"], str] | None:
         """The mask from its run lengths."""
         file = self._stored(scene_id, im_id, f"{kind}.json")
         if file is None:
@@ -121,7 +122,7 @@ class ShardSource:
         return None if gt_index not in masks else (decode_runs(masks[gt_index], where), where)
 
 
-def decode_runs(entry: Any, where: str) -> Bool[Array, "h w"]:
+def decode_runs(entry: Any, where: str) -> Bool[np.ndarray, "h w"]:
     """A mask from its run lengths: pixels column by column, off and on in turn, off first (COCO's, uncompressed).
 
     Raises:

@@ -1,4 +1,4 @@
-"""Writing BOP datasets: a frame at a time, images first, the JSON that makes it count last."""
+"""Writer of BOP datasets: frame by frame, images first, the JSON that lists them last."""
 
 import json
 import os
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from posecore.bop.dataset import GroundTruth, Target
+from posecore.bop.dataset import BopTarget, GroundTruth
 from posecore.bop.images import write_image
 from posecore.bop.jsonfile import as_list, integer_keys, read_json, write_json
 from posecore.bop.models_info import MM, ModelInfo, save_models_info
@@ -21,19 +21,45 @@ from posecore.errors import DatasetError
 from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh, save_ply
 
-Array = np.ndarray
 SCENE_FILES = ("scene_gt_info.json", "scene_camera.json", "scene_gt.json")
-"""In writing order: scene_gt.json, which decides what frames there are, is the last."""
+"""In writing order: scene_gt.json, which lists the frames, is the last."""
 JOURNAL = ".frames.jsonl"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrameEntry:
-    """What the three JSON files of a scene say about one frame. Plain data: it may come from another process."""
+    """Entries of a frame in the three JSON files of its scene. Plain data, so that another process can make it."""
 
     info: list[dict[str, Any]]
     camera: dict[str, Any]
     gt: list[dict[str, Any]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FrameRecord:
+    """One image with its ground truth.
+
+    Attributes:
+        rgb: Colour image.
+        depth_m: Camera z, 0 where unknown; None for a dataset without depth.
+        camera: Intrinsics of this image.
+        gts: Annotated objects.
+        masks: Full silhouette of each object, as if nothing occluded it. A mask may be larger than the image, so that
+            boxes and pixel counts cover parts outside the image.
+        masks_visib: Visible part of each silhouette.
+        mask_origin_px: Column and row in `masks` of the image's top left pixel.
+        T_cam_world: Pose of the world that the frames of a scene share, metres, for BOP's optional `cam_R_w2c` and
+            `cam_t_w2c`.
+    """
+
+    rgb: UInt8[np.ndarray, "h w 3"]
+    depth_m: Float[np.ndarray, "dh dw"] | None
+    camera: Camera
+    gts: Sequence[GroundTruth]
+    masks: Sequence[Bool[np.ndarray, "mh mw"]]
+    masks_visib: Sequence[Bool[np.ndarray, "vh vw"]]
+    mask_origin_px: tuple[int, int] = (0, 0)
+    T_cam_world: Float[np.ndarray, "4 4"] | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,66 +85,42 @@ class FrameFiles:
         if self.image_format not in ("png", "jpg"):
             raise DatasetError(f"image format: found '{self.image_format}', expected png or jpg")
 
-    def write(
-        self,
-        im_id: int,
-        rgb: UInt8[Array, "h w 3"],
-        depth_m: Float[Array, "dh dw"] | None,
-        camera: Camera,
-        gts: Sequence[GroundTruth],
-        masks: Sequence[Bool[Array, "mh mw"]],
-        masks_visib: Sequence[Bool[Array, "vh vw"]],
-        *,
-        mask_origin_px: tuple[int, int] = (0, 0),
-        T_cam_world: Float[Array, "4 4"] | None = None,
-    ) -> FrameEntry:
-        """Write colour, depth and masks of one frame; the frame counts once its entry is committed.
-
-        Args:
-            im_id: image number.
-            rgb: colour image.
-            depth_m: camera z, 0 where unknown; None for a dataset without depth.
-            camera: intrinsics of this image.
-            gts: annotated objects.
-            masks: full silhouette of each object, as if nothing stood before it. It may be larger than the image, so
-                that boxes and pixel counts cover parts outside of it.
-            masks_visib: visible part of each silhouette.
-            mask_origin_px: column and row in `masks` where the image's top left pixel lies.
-            T_cam_world: pose of the world that the frames of a scene share, metres, for BOP's optional `cam_R_w2c`
-                and `cam_t_w2c`.
+    def write(self, im_id: int, frame: FrameRecord) -> FrameEntry:
+        """Write colour, depth and masks of a frame, which counts once its entry is committed.
 
         Raises:
             DatasetError: counts or sizes disagree, or a depth does not fit into 16 bits.
         """
-        size = rgb.shape[:2]
+        gts, masks, masks_visib, depth_m = frame.gts, frame.masks, frame.masks_visib, frame.depth_m
+        size = frame.rgb.shape[:2]
         where = f"{self.scene_path}, image {im_id}"
         if len(gts) != len(masks) or len(gts) != len(masks_visib):
             raise DatasetError(f"{where}: {len(gts)} objects, {len(masks)} masks, {len(masks_visib)} visible masks")
-        if size != (camera.height_px, camera.width_px):
-            raise DatasetError(
-                f"{where}: the image is {size[1]} x {size[0]}, the camera {camera.width_px} x {camera.height_px}"
-            )
+        width_px, height_px = frame.camera.width_px, frame.camera.height_px
+        if size != (height_px, width_px):
+            raise DatasetError(f"{where}: the image is {size[1]} x {size[0]}, the camera {width_px} x {height_px}")
         if depth_m is not None and depth_m.shape != size:
             raise DatasetError(
                 f"{where}: the image is {size[1]} x {size[0]}, depth {depth_m.shape[1]} x {depth_m.shape[0]}"
             )
-        column, row = mask_origin_px
+        column, row = frame.mask_origin_px
         cropped = [mask[row : row + size[0], column : column + size[1]] for mask in masks]
         if any(mask.shape != size for mask in [*cropped, *masks_visib]):
             raise DatasetError(f"{where}: a mask does not cover the image of {size[1]} x {size[0]} pixels")
-        self._write_images(im_id, rgb, depth_m, where)
+        self._write_images(im_id, frame.rgb, depth_m, where)
         info = []
         for index, (full, inside, visible) in enumerate(zip(masks, cropped, masks_visib, strict=True)):
             self._write_mask("mask", im_id, index, inside)
             self._write_mask("mask_visib", im_id, index, visible)
-            info.append(gt_info(full, inside, visible, depth_m, mask_origin_px))
-        entry: dict[str, Any] = {"cam_K": as_list(camera.K), "depth_scale": self.depth_scale}
-        if T_cam_world is not None:
-            entry |= {"cam_R_w2c": as_list(T_cam_world[:3, :3]), "cam_t_w2c": as_list(T_cam_world[:3, 3] / MM)}
+            info.append(gt_info(full, inside, visible, depth_m, frame.mask_origin_px))
+        entry: dict[str, Any] = {"cam_K": as_list(frame.camera.K), "depth_scale": self.depth_scale}
+        if frame.T_cam_world is not None:
+            R, t_m = frame.T_cam_world[:3, :3], frame.T_cam_world[:3, 3]
+            entry |= {"cam_R_w2c": as_list(R), "cam_t_w2c": as_list(t_m / MM)}
         return FrameEntry(info=info, camera=entry, gt=[_gt_entry(gt) for gt in gts])
 
     def _write_images(
-        self, im_id: int, rgb: UInt8[Array, "h w 3"], depth_m: Float[Array, "h w"] | None, where: str
+        self, im_id: int, rgb: UInt8[np.ndarray, "h w 3"], depth_m: Float[np.ndarray, "h w"] | None, where: str
     ) -> None:
         name = f"{im_id:06d}"
         write_image(self.scene_path / "rgb" / f"{name}.{self.image_format}", rgb, self.jpeg_quality)
@@ -130,7 +132,7 @@ class FrameFiles:
             raise DatasetError(f"{where}: a depth is outside 0 to {limit:.3g} m; choose a larger depth scale")
         write_image(self.scene_path / "depth" / f"{name}.png", steps.astype(np.uint16))
 
-    def _write_mask(self, folder: str, im_id: int, index: int, mask: Bool[Array, "h w"]) -> None:
+    def _write_mask(self, folder: str, im_id: int, index: int, mask: Bool[np.ndarray, "h w"]) -> None:
         write_image(self.scene_path / folder / f"{im_id:06d}_{index:06d}.png", mask.astype(np.uint8) * 255)
 
 
@@ -186,7 +188,7 @@ class BopWriter:
         return {im_id: tuple(json.dumps(content[im_id]) for content in contents) for im_id in complete}
 
     def _noted(self) -> dict[int, tuple[str, ...]]:
-        """The journal's frames; what follows its last whole line is cut off."""
+        """The journal's frames; a partial last line is truncated."""
         try:
             data = self._journal.read_bytes() if self._journal.is_file() else b""
             whole = data[: data.rfind(b"\n") + 1]
@@ -216,34 +218,11 @@ class BopWriter:
         """Frames that are complete on disk."""
         return sorted(self._entries)
 
-    def add_frame(
-        self,
-        im_id: int,
-        rgb: UInt8[Array, "h w 3"],
-        depth_m: Float[Array, "dh dw"] | None,
-        camera: Camera,
-        gts: Sequence[GroundTruth],
-        masks: Sequence[Bool[Array, "mh mw"]],
-        masks_visib: Sequence[Bool[Array, "vh vw"]],
-        *,
-        mask_origin_px: tuple[int, int] = (0, 0),
-        T_cam_world: Float[Array, "4 4"] | None = None,
-    ) -> None:
+    def add_frame(self, im_id: int, frame: FrameRecord) -> None:
         """Write one frame; it survives the process once this returns. See `FrameFiles.write`."""
-        entry = self.files.write(
-            im_id,
-            rgb,
-            depth_m,
-            camera,
-            gts,
-            masks,
-            masks_visib,
-            mask_origin_px=mask_origin_px,
-            T_cam_world=T_cam_world,
-        )
-        self.commit(im_id, entry)
+        self.commit(im_id, self.files.write(im_id, frame))
         if not (self.root / "camera.json").exists():
-            write_camera(self.root, camera, self.files.depth_scale)
+            write_camera(self.root, frame.camera, self.files.depth_scale)
 
     def commit(self, im_id: int, entry: FrameEntry) -> None:
         """Note a frame whose files are written.
@@ -288,16 +267,16 @@ def scene_folder(root: str | Path, split: str, scene_id: int) -> Path:
 
 
 def gt_info(
-    full: Bool[Array, "mh mw"],
-    inside: Bool[Array, "h w"],
-    visible: Bool[Array, "h w"],
-    depth_m: Float[Array, "h w"] | None,
+    full: Bool[np.ndarray, "mh mw"],
+    inside: Bool[np.ndarray, "h w"],
+    visible: Bool[np.ndarray, "h w"],
+    depth_m: Float[np.ndarray, "h w"] | None,
     mask_origin_px: tuple[int, int] = (0, 0),
 ) -> dict[str, Any]:
     """The entry of `scene_gt_info.json` for one object.
 
     Definitions are those of bop_toolkit's calc_gt_info: `px_count_all` counts the whole silhouette, also outside the
-    image; `px_count_valid` its pixels in the image whose depth is known (all of them without depth);
+    image; `px_count_valid` its pixels in the image whose depth is known (all pixels without depth);
     `visib_fract` = visible / all; a box is x, y of its first pixel and last minus first pixel as width and height, and
     all -1 where nothing is visible.
     """
@@ -313,7 +292,7 @@ def gt_info(
     }
 
 
-def _box(mask: Bool[Array, "h w"], origin_px: tuple[int, int]) -> list[int]:
+def _box(mask: Bool[np.ndarray, "h w"], origin_px: tuple[int, int]) -> list[int]:
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
         return [-1] * 4
@@ -343,7 +322,7 @@ def write_models(root: str | Path, meshes: Mapping[int, Mesh], infos: Mapping[in
     save_models_info(folder / "models_info.json", dict(meshes), dict(infos or {}))
 
 
-def write_targets(root: str | Path, split: str, targets: Iterable[Target]) -> None:
+def write_targets(root: str | Path, split: str, targets: Iterable[BopTarget]) -> None:
     """Write the split's targets in BOP19's format (objects and how often) and BOP24's (images only)."""
     ordered = sorted(targets)
     content = [
@@ -358,27 +337,27 @@ def write_targets(root: str | Path, split: str, targets: Iterable[Target]) -> No
     )
 
 
-def visible_targets(root: str | Path, split: str, scene_id: int, min_visible: float = 0.1) -> list[Target]:
-    """What is to be found in a scene: each object of an image with how many instances are visible enough.
+def visible_targets(root: str | Path, split: str, scene_id: int, min_visible: float = 0.1) -> list[BopTarget]:
+    """Targets of a scene: each object of an image with the number of instances that are visible enough.
 
-    The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible share of 0.1, and an
+    The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible fraction of 0.1, and an
     object without one is no target.
 
     Args:
         root: dataset folder.
         split: split folder's name.
         scene_id: a finished scene.
-        min_visible: smallest visible share.
+        min_visible: smallest visible fraction.
     """
     folder = scene_folder(root, split, scene_id)
-    truth, info = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
+    annotated, info = read_json(folder / "scene_gt.json"), read_json(folder / "scene_gt_info.json")
     targets = []
-    for im_id, gts in truth.items():
+    for im_id, gts in annotated.items():
         seen = Counter(
             gt["obj_id"] for gt, about in zip(gts, info[im_id], strict=True) if about["visib_fract"] >= min_visible
         )
         targets += [
-            Target(scene_id=scene_id, im_id=int(im_id), obj_id=obj_id, inst_count=count)
+            BopTarget(scene_id=scene_id, im_id=int(im_id), obj_id=obj_id, inst_count=count)
             for obj_id, count in seen.items()
         ]
     return sorted(targets)

@@ -1,4 +1,4 @@
-"""The field table: what a sample holds, and how its values become stored numbers."""
+"""The field table: fields of a sample and the quantisation of their values."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,6 @@ from posecore.config import load_yaml
 from posecore.errors import ShardError
 from posecore.files import data_spec
 
-Array = np.ndarray
 BIT_OBJECT, BIT_VISIBLE, BIT_FOREGROUND = 1, 2, 4
 """Bits of `scene_mask`: the object's whole silhouette, its visible part, and anything in front of the background."""
 
@@ -43,12 +42,12 @@ class Field:
     squared: bool = False
 
     def size(self, patch_px: int, contour_points: int) -> tuple[int, ...]:
-        """Shape of one sample's value."""
+        """Shape of a sample's value."""
         symbols = {"P": patch_px, "C": contour_points}
         return tuple(symbols[s] if isinstance(s, str) else s for s in self.shape)
 
     def step(self, card: Mapping[str, Any]) -> float | None:
-        """What one step of the stored integer is worth in `unit`; None when values are stored exactly.
+        """Value of a step of the stored integer, in `unit`; None when values are stored exactly.
 
         Raises:
             ShardError: The card lacks the entry that `scale` names.
@@ -64,8 +63,8 @@ class Field:
         """Type of the values that a reader gives."""
         return np.dtype(np.float32) if self.squared or self.scale is not None else np.dtype(self.dtype)
 
-    def encode(self, values: Array, card: Mapping[str, Any]) -> Array:
-        """Values in `unit` to what is stored; rounds to the nearest step and refuses what does not fit."""
+    def encode(self, values: np.ndarray, card: Mapping[str, Any]) -> np.ndarray:
+        """Quantise values in `unit`: rounds to the nearest step and refuses values out of range."""
         step = self.step(card)
         if self.squared:
             return self._square(values)
@@ -80,8 +79,8 @@ class Field:
             )
         return np.asarray(stored.astype(self.dtype))
 
-    def decode(self, stored: Array, card: Mapping[str, Any], out: Array) -> None:
-        """What is stored to values in `unit`, into an array of `decoded_dtype`."""
+    def decode(self, stored: np.ndarray, card: Mapping[str, Any], out: np.ndarray) -> None:
+        """Convert stored numbers to values in `unit`, into an array of `decoded_dtype`."""
         step = self.step(card)
         if self.squared:
             np.sqrt(stored, out=out, dtype=np.float32, casting="same_kind")
@@ -90,7 +89,7 @@ class Field:
         else:
             out[...] = stored
 
-    def _square(self, values: Array) -> Array:
+    def _square(self, values: np.ndarray) -> np.ndarray:
         square = np.square(values, dtype=np.float32)
         stored = np.rint(square)
         exact = np.abs(square - stored).max() <= _SQUARE_TOLERANCE and stored.max() <= np.iinfo(self.dtype).max

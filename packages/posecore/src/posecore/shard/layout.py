@@ -24,7 +24,7 @@ def samples_in(card: Mapping[str, Any], shard_id: int) -> int:
 
 
 def shard_key(field: Field, shard_id: int) -> str:
-    """Where a field's file of a shard lies."""
+    """Store key of a shard's file for a field."""
     return "/".join([field.name, "c", str(shard_id), *["0"] * len(field.shape)])
 
 
@@ -89,10 +89,10 @@ def read_card(url: str, group: bytes) -> dict[str, Any]:
             f"{url}/{GROUP}: not the metadata of a Zarr v3 group; the dataset is damaged, delete it and render it again"
         ) from error
     name, version = schema()
-    found = (card.get("schema"), card.get("schema_version"))
-    if found != (name, version):
+    stored = (card.get("schema"), card.get("schema_version"))
+    if stored != (name, version):
         raise ShardError(
-            f"{url}: schema {found[0]} version {found[1]}, expected {name} version {version}; "
+            f"{url}: schema {stored[0]} version {stored[1]}, expected {name} version {version}; "
             "render the dataset again with this version, or use the version that made it"
         )
     return card
@@ -107,7 +107,7 @@ def parse_manifest(url: str, data: bytes) -> list[dict[str, Any]]:
     """The lines of a manifest's content.
 
     Raises:
-        ShardError: One is broken.
+        ShardError: A line is broken.
     """
     lines = []
     for number, text in enumerate(data.decode("utf-8", "replace").splitlines(), start=1):
@@ -121,9 +121,9 @@ def parse_manifest(url: str, data: bytes) -> list[dict[str, Any]]:
     return lines
 
 
-def check_same_card(url: str, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+def check_same_card(url: str, stored: Mapping[str, Any], requested: Mapping[str, Any]) -> None:
     """Raise the first difference between two cards as a ShardError."""
-    difference = _first_difference(found, wanted, "")
+    difference = _first_difference(stored, requested, "")
     if difference:
         raise ShardError(
             f"{url}: holds another dataset ({difference}); choose another --out, or delete that folder, "
@@ -131,11 +131,11 @@ def check_same_card(url: str, found: Mapping[str, Any], wanted: Mapping[str, Any
         )
 
 
-def _first_difference(found: Any, wanted: Any, path: str) -> str | None:
-    if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        for key in sorted({*found, *wanted}):
-            difference = _first_difference(found.get(key), wanted.get(key), f"{path}.{key}" if path else key)
+def _first_difference(stored: Any, requested: Any, path: str) -> str | None:
+    if isinstance(stored, Mapping) and isinstance(requested, Mapping):
+        for key in sorted({*stored, *requested}):
+            difference = _first_difference(stored.get(key), requested.get(key), f"{path}.{key}" if path else key)
             if difference:
                 return difference
         return None
-    return None if found == wanted else f"{path} is {found!r} there and {wanted!r} here"
+    return None if stored == requested else f"{path} is {stored!r} there and {requested!r} here"

@@ -23,8 +23,6 @@ from posecore.shard.layout import (
 )
 from posecore.store import open_store
 
-Array = np.ndarray
-
 
 class ShardReader:
     """Reads a dataset, complete or still growing.
@@ -61,13 +59,18 @@ class ShardReader:
 
     @property
     def committed(self) -> list[int]:
-        """Ids of the shards that are there, sorted."""
+        """Ids of the committed shards, sorted."""
         return sorted(self._lines)
 
     @property
     def complete(self) -> bool:
-        """Whether every shard is there."""
+        """Whether every shard is committed."""
         return len(self._lines) == n_shards(self.card)
+
+    @property
+    def manifest_lines(self) -> Mapping[int, Mapping[str, Any]]:
+        """Lines of the manifest by shard id, sorted."""
+        return {shard_id: self._lines[shard_id] for shard_id in self.committed}
 
     def n_samples(self, shard_id: int) -> int:
         """Samples in a shard."""
@@ -90,7 +93,7 @@ class ShardReader:
             raise ShardError(f"{self.url}/{key}: missing from the dataset; render it again")
         return data
 
-    def read(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, Array]:
+    def read(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
         """Decode a whole shard, or some of its fields, into physical units.
 
         Every chunk is held against its CRC-32C.
@@ -119,14 +122,14 @@ class ShardReader:
         key = shard_key(field, shard_id)
         data, expected = self._store.get(key), line["bytes"].get(field.name)
         if data is None or len(data) != expected:
-            found = "no file" if data is None else f"{len(data)} bytes"
+            actual = "no file" if data is None else f"{len(data)} bytes"
             raise ShardError(
-                f"{self.url}/{key}: found {found}, expected {expected} bytes; the shard is damaged: run the same "
+                f"{self.url}/{key}: found {actual}, expected {expected} bytes; the shard is damaged: run the same "
                 "`synthgen render` again, which renders damaged shards anew"
             )
         return data
 
-    def _decode(self, field: Field, shard_id: int, data: bytes) -> Array:
+    def _decode(self, field: Field, shard_id: int, data: bytes) -> np.ndarray:
         chunk, *size = chunk_shape(field, self.card)
         values = np.empty((self.n_samples(shard_id), *size), field.decoded_dtype)
         for first in range(0, len(values), chunk):

@@ -19,8 +19,6 @@ import google_crc32c
 import numpy as np
 from numcodecs import blosc, zstd
 
-Array = np.ndarray
-
 MOST_CHUNK_SAMPLES = 8
 """Samples of a patch field that are compressed together: what reading one sample alone costs."""
 
@@ -61,7 +59,7 @@ def codecs(codec: str, dtype: str, ndim: int) -> list[dict[str, Any]]:
     return [*chain, {"name": "crc32c"}]
 
 
-def pack(stored: Array, codec: str, shard_size: int, chunk: int) -> bytes:
+def pack(stored: np.ndarray, codec: str, shard_size: int, chunk: int) -> bytes:
     """A shard file.
 
     Args:
@@ -84,7 +82,9 @@ def pack(stored: Array, codec: str, shard_size: int, chunk: int) -> bytes:
     return b"".join([*parts, _with_crc(index.tobytes())])
 
 
-def unpack(data: bytes, codec: str, dtype: str, chunk_shape: tuple[int, ...], shard_size: int, first: int) -> Array:
+def unpack(
+    data: bytes, codec: str, dtype: str, chunk_shape: tuple[int, ...], shard_size: int, first: int
+) -> np.ndarray:
     """One inner chunk of a shard file.
 
     Args:
@@ -109,7 +109,7 @@ def unpack(data: bytes, codec: str, dtype: str, chunk_shape: tuple[int, ...], sh
     return _decompress(part, codec, np.dtype(dtype).newbyteorder("<"), chunk_shape)
 
 
-def _compress(values: Array, codec: str) -> bytes:
+def _compress(values: np.ndarray, codec: str) -> bytes:
     values = np.ascontiguousarray(values, values.dtype.newbyteorder("<"))
     if "planes" in codec:
         values = np.stack([np.stack(cv2.split(image)) for image in values])
@@ -128,7 +128,7 @@ def _compress(values: Array, codec: str) -> bytes:
             blosc.use_threads = threads
 
 
-def _decompress(data: memoryview, codec: str, dtype: np.dtype, shape: tuple[int, ...]) -> Array:
+def _decompress(data: memoryview, codec: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     flat = np.empty(int(np.prod(shape)), dtype)
     (blosc if "shuffle" in codec else zstd).decompress(data, flat.view(np.uint8))
     if "delta" in codec:
@@ -148,7 +148,7 @@ def _with_crc(data: bytes) -> bytes:
 
 def _checked(data: memoryview) -> memoryview:
     """Bytes without the checksum behind them."""
-    body, found = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
-    if google_crc32c.value(bytes(body)) != int.from_bytes(found, "little"):
+    body, checksum = data[:-_CRC_BYTES], data[-_CRC_BYTES:]
+    if google_crc32c.value(bytes(body)) != int.from_bytes(checksum, "little"):
         raise ValueError("checksum differs")
     return body

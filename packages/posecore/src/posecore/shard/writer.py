@@ -25,8 +25,6 @@ from posecore.shard.layout import (
 )
 from posecore.store import open_store
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True)
 class Encoded:
@@ -60,22 +58,22 @@ class ShardWriter:
             ShardError: The place holds something else; the message names the first key that differs.
             StorageError: The place cannot be reached or written.
         """
-        # The folders of the fields alone are what a run leaves that was killed before the group's own file was written.
-        own = {field.name for field in field_table()}
+        # A run that was killed before it wrote the group's own file leaves only the folders of the fields.
+        expected = {field.name for field in field_table()}
         name, version = schema()
         full = json.loads(json.dumps({"schema": name, "schema_version": version, **card}))
         store = open_store(str(url))
         existing = store.get(GROUP)
         if existing is not None:
             check_same_card(str(url), read_card(str(url), existing), full)
-        elif foreign := [entry for entry in store.list_names() if entry not in own]:
+        elif foreign := [entry for entry in store.list_names() if entry not in expected]:
             raise ShardError(
                 f"{url}: the folder is not empty ({foreign[0]} is in it) and holds no dataset; "
                 "choose an empty or new folder"
             )
         writer = cls(str(url), full)
         if existing is None:
-            for key, data in metadata(full).items():  # the group's own file is the last: it says "exists"
+            for key, data in metadata(full).items():  # the group's own file is the last: with it the dataset exists
                 store.set(key, data)
         return writer
 
@@ -84,16 +82,16 @@ class ShardWriter:
         return sorted(line["shard"] for line in read_manifest(self.url, self._store))
 
     def quarantined(self) -> list[int]:
-        """Scenes that stand in for ones which crash the renderer, sorted."""
+        """Replacements of scenes that crash the renderer, sorted."""
         return sorted(scene for line in read_manifest(self.url, self._store) for scene in line.get("quarantined", ()))
 
     def damaged(self) -> dict[int, str]:
-        """Committed shards of which a file is missing or of another length than the manifest says, and what is wrong.
+        """Faults of committed shards: a file is missing or its length differs from the manifest.
 
         The folders are listed, nothing is read.
         """
         lines = read_manifest(self.url, self._store)
-        found: dict[int, str] = {}
+        faults: dict[int, str] = {}
         for field in field_table():
             sizes = self._store.sizes(field.name) if lines else {}
             for line in lines:
@@ -101,18 +99,18 @@ class ShardWriter:
                 size = sizes.get(key)
                 if size != expected:
                     there = "is missing" if size is None else f"has {size} bytes"
-                    found.setdefault(line["shard"], f"{key} {there}, expected {expected} bytes")
-        return found
+                    faults.setdefault(line["shard"], f"{key} {there}, expected {expected} bytes")
+        return faults
 
-    def encode(self, shard_id: int, arrays: Mapping[str, Array]) -> Encoded:
+    def encode(self, shard_id: int, arrays: Mapping[str, np.ndarray]) -> Encoded:
         """Compress one shard; needs no store, so workers do it.
 
         Args:
-            shard_id: Which one.
+            shard_id: Its id.
             arrays: Every field of the table with the sample axis in front, in the field's unit.
 
         Raises:
-            ShardError: A field is missing, of another shape than the table says, or has values that do not fit.
+            ShardError: A field is missing, of another shape than in the field table, or has values that do not fit.
         """
         return encode(self.card, shard_id, arrays)
 
@@ -120,9 +118,9 @@ class ShardWriter:
         """Write a shard's files, then its line in the manifest. Call from one process only."""
         for field in field_table():
             self._store.set(shard_key(field, encoded.shard_id), encoded.files[field.name])
-        found = self._store.get(MANIFEST) or b""
-        if found != self._manifest:  # thousands of lines: parsed again only when somebody else has changed them
-            self._lines = {line["shard"]: _line_text(line) for line in parse_manifest(self.url, found)}
+        stored = self._store.get(MANIFEST) or b""
+        if stored != self._manifest:  # thousands of lines: parsed again only when another process has changed them
+            self._lines = {line["shard"]: _line_text(line) for line in parse_manifest(self.url, stored)}
         self._lines[encoded.shard_id] = _line_text(encoded.line)
         self._manifest = "".join(text for _, text in sorted(self._lines.items())).encode()
         self._store.set(MANIFEST, self._manifest)
@@ -133,10 +131,10 @@ class ShardWriter:
         Raises:
             ShardError: The dataset holds another file there.
         """
-        found = self._store.get(key)
-        if found is None:
+        stored = self._store.get(key)
+        if stored is None:
             self._store.set(key, data)
-        elif found != data:
+        elif stored != data:
             raise ShardError(
                 f"{self.url}/{key}: is not the file that these settings make; start with the same settings (objects, "
                 "--models-info) to resume, or choose another --out"
@@ -147,7 +145,7 @@ def _line_text(line: Mapping[str, Any]) -> str:
     return json.dumps(line, sort_keys=True) + "\n"
 
 
-def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) -> Encoded:
+def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, np.ndarray]) -> Encoded:
     """Compress one shard of the dataset with this card. See `ShardWriter.encode`."""
     count = samples_in(card, shard_id)
     packed: dict[str, bytes] = {}
@@ -156,8 +154,8 @@ def encode(card: Mapping[str, Any], shard_id: int, arrays: Mapping[str, Array]) 
         chunk, *size = chunk_shape(field, card)
         shape = (count, *size)
         if field.name not in arrays or arrays[field.name].shape != shape:
-            found = arrays[field.name].shape if field.name in arrays else "nothing"
-            raise ShardError(f"shard {shard_id}, {field.name}: found {found}, expected shape {shape}")
+            actual = arrays[field.name].shape if field.name in arrays else "nothing"
+            raise ShardError(f"shard {shard_id}, {field.name}: found {actual}, expected shape {shape}")
         stored = field.encode(arrays[field.name], card)
         packed[field.name] = sharding_codec.pack(stored, field.codec, int(card["shard_size"]), chunk)
         digest.update(packed[field.name])

@@ -1,17 +1,15 @@
 """The `refinenet` command: one module for each of its commands."""
 
 import click
+from posecore.command_line import CONTEXT_SETTINGS, ErrorReportingGroup
 
 from refinenet.cli.export import export
-from refinenet.cli.group import CleanGroup
 from refinenet.cli.refine import refine
 from refinenet.cli.track import track
 from refinenet.cli.train import train
 
-_CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
 
-
-@click.group(cls=CleanGroup, context_settings=_CONTEXT)
+@click.group(cls=ErrorReportingGroup, context_settings=CONTEXT_SETTINGS)
 @click.version_option(package_name="refinenet")
 def main() -> None:
     """Train pose refinement networks and refine poses with them.

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import click
 
-from refinenet.cli.console import start_logging
 from refinenet.cli.options import FILE, NEW_FILE, verbose_option
 
 
@@ -14,7 +13,7 @@ from refinenet.cli.options import FILE, NEW_FILE, verbose_option
     "--out", required=True, type=NEW_FILE, metavar="FILE", help="model.onnx (ONNX) or model.pt2 (torch.export)."
 )
 @verbose_option
-def export(checkpoint: Path, out: Path, verbose: bool) -> None:
+def export(checkpoint: Path, out: Path) -> None:
     """Write a network for other runtimes: one update for a batch of pairs of patches.
 
     The file is run and compared with the network before it is written.
@@ -23,7 +22,6 @@ def export(checkpoint: Path, out: Path, verbose: bool) -> None:
     refinenet export --checkpoint best.safetensors --out model.onnx
     refinenet export --checkpoint best.safetensors --out model.pt2
     """
-    start_logging(verbose)
     from posecore.files import require_writable
 
     from refinenet.models import checkpoint as checkpoints

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import click
 from click.core import ParameterSource
+from posecore import command_line
 
 from refinenet.refiner import BASELINES, NETWORK
 
@@ -41,7 +42,7 @@ other_mesh_option = click.option(
     "--allow-other-mesh", is_flag=True, help="Take a mesh of the trained object's size that is not the trained one."
 )
 quiet_option = click.option("--quiet", is_flag=True, help="No progress line.")
-verbose_option = click.option("--verbose", is_flag=True, help="Log details to stderr.")
+verbose_option = command_line.verbose_option("refinenet")
 
 
 def require_apart(read: Mapping[str, Path | None], written: Mapping[str, Path | None]) -> None:

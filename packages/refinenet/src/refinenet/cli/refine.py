@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from posecore.command_line import end_early, progress_bar
 from posecore.errors import ConfigError, PoseError
 
-from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -94,7 +94,6 @@ def refine(
     workers: int,
     allow_other_mesh: bool,
     quiet: bool,
-    verbose: bool,
 ) -> None:
     """Refine BOP estimates; the result file's sidecar says with what.
 
@@ -109,7 +108,6 @@ def refine(
     refinenet refine --method search --dataset lmo --init start.csv --out searched.csv
     refinenet refine --method search --checkpoint flow.safetensors --dataset lmo --init start.csv --out both.csv
     """
-    start_logging(verbose)
     require_fit(method, checkpoint, WITH_NETWORK)
     if hypotheses > 1 and method != NETWORK:
         raise click.UsageError(f"--hypotheses is for --method network, {method} does without")
@@ -144,7 +142,7 @@ def refine(
         torch.set_num_threads(threads)
     loaded = None if checkpoint is None else checkpoints.load(checkpoint)
     bop = BopDataset(dataset, split)
-    given = read_results(init, bop, of="camera")
+    given = read_results(init, bop, images="camera")
     starts = [s for s in given if not objects or s.obj_id in objects]
     if not given:
         raise ConfigError(f"{init}: no poses in it, there is nothing to refine")

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import end_early, progress_bar
 from posecore.errors import ConfigError, PoseError
 
-from refinenet.cli.console import end_early, progress_bar, start_logging
 from refinenet.cli.options import (
     FILE,
     NEW_FILE,
@@ -104,7 +104,6 @@ def track(
     threads: int,
     allow_other_mesh: bool,
     quiet: bool,
-    verbose: bool,
 ) -> None:
     """Track objects through SOURCE: a scene of a BOP dataset, a folder of images, or a video file.
 
@@ -117,7 +116,6 @@ def track(
     refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
         --out track.csv --video annotated.mp4
     """
-    start_logging(verbose)
     require_fit(method, checkpoint)
     if video is None:
         require_used("without --video", "fps")

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import progress_bar, stoppable
 
-from refinenet.cli.console import progress_bar, start_logging, stoppable
 from refinenet.cli.options import FILE, quiet_option, verbose_option
 
 if TYPE_CHECKING:
@@ -63,7 +63,6 @@ def train(
     follow: bool,
     skip_bad_shards: bool,
     quiet: bool,
-    verbose: bool,
     steps: int | None,
     batch: int | None,
     loss: str | None,
@@ -85,7 +84,6 @@ def train(
     refinenet train shards/ --follow --set optimiser.ema_decay=0.999 --set optimiser.accumulate=4
     torchrun --nproc-per-node 4 -m refinenet train s3://bucket/shards --preset paper
     """
-    start_logging(verbose)
     from refinenet.config import load_config
     from refinenet.training.loop import train as run
 
@@ -100,7 +98,11 @@ def train(
     assigned = [*overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
     config = load_config(preset, assigned, file)
     folder = out or Path("runs") / preset
-    with stoppable(folder), _quiet_threads(), _training_bar(config.steps, quiet) as report:
+    with (
+        stoppable(lambda: f"what was finished is in {folder}" if folder.exists() else None),
+        _quiet_threads(),
+        _training_bar(config.steps, quiet) as report,
+    ):
         errors = run(config, shards, folder, resume=resume, report=report)
     if errors:  # under torchrun, rank 0 has them
         for line in (*_comparison(errors), *_which(folder, config.steps)):

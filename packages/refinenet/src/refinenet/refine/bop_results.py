@@ -203,7 +203,7 @@ def make_sidecar(
 ) -> dict[str, Any]:
     """What is written beside a refined result file.
 
-    `start_lines` holds the start file's line of every estimate, `failed_lines` those of the poses that failed. What
+    `initial_lines` holds the start file's line of every estimate, `failed_lines` those of the poses that failed. What
     the start file's own sidecar says about how its poses were perturbed is carried over.
     """
     sidecar: dict[str, Any] = {"dataset": str(dataset.root.resolve()), "split": dataset.split, "method": name}
@@ -212,7 +212,7 @@ def make_sidecar(
     sidecar |= {
         "settings": {"refinenet": __version__, **method.settings},
         "init": start_path.name,
-        "start_lines": [one.start.line for one in refined.kept],
+        "initial_lines": [one.start.line for one in refined.kept],
         "failed_lines": list(refined.failures),
         "failures": {str(line): why for line, why in refined.failures.items()},
     }

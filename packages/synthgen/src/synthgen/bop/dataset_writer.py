@@ -17,6 +17,7 @@ from posecore.bop import (
     BopWriter,
     FrameEntry,
     FrameFiles,
+    FrameRecord,
     ModelInfo,
     scene_folder,
     visible_targets,
@@ -93,17 +94,17 @@ class FrameRenderer:
             depth_scale=job.depth_scale,
             image_format=job.image_format,
         )
-        return files.write(
-            im_id,
-            frame.rgb,
-            frame.depth_m,
-            self._maker.camera,
-            frame.truths,
-            frame.masks,
-            frame.masks_visib,
+        record = FrameRecord(
+            rgb=frame.rgb,
+            depth_m=frame.depth_m,
+            camera=self._maker.camera,
+            gts=frame.truths,
+            masks=frame.masks,
+            masks_visib=frame.masks_visib,
             mask_origin_px=frame.mask_origin_px,
             T_cam_world=frame.T_cam_world if job.plan.shares_layout else None,
         )
+        return files.write(im_id, record)
 
     def close(self) -> None:
         """Free the engines."""

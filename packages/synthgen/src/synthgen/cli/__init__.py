@@ -1,22 +1,20 @@
 """The `synthgen` command: render training pairs, render BOP frames, look at what was rendered."""
 
 import click
+from posecore.command_line import CONTEXT_SETTINGS, ErrorReportingGroup
 
 from synthgen.cli.bop import bop
 from synthgen.cli.cut import cut
 from synthgen.cli.doctor import doctor
 from synthgen.cli.export import export
-from synthgen.cli.group import CleanGroup
 from synthgen.cli.info import info
 from synthgen.cli.merge import merge
 from synthgen.cli.preview import preview
 from synthgen.cli.render import render
 from synthgen.cli.verify import verify
 
-_CONTEXT = {"help_option_names": ["-h", "--help"], "show_default": True, "max_content_width": 110}
 
-
-@click.group(cls=CleanGroup, context_settings=_CONTEXT)
+@click.group(cls=ErrorReportingGroup, context_settings=CONTEXT_SETTINGS)
 @click.version_option(package_name="synthgen")
 def main() -> None:
     """Render training pairs and test images of an object from its mesh.

@@ -3,9 +3,9 @@
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, start_logging, stoppable
-from synthgen.cli.options import scene_options
+from synthgen.cli.options import resumable, scene_options
 
 if TYPE_CHECKING:
     from synthgen.bop.frame_maker import Split
@@ -53,7 +53,6 @@ def bop(
     preset: str,
     overrides: tuple[str, ...],
     quiet: bool,
-    verbose: bool,
     **values: Any,
 ) -> None:
     """Render whole camera images, or tracking sequences, with ground truth as a BOP dataset.
@@ -75,7 +74,6 @@ def bop(
     from synthgen.bop.frame_maker import FramePlan
     from synthgen.config import load_config
 
-    start_logging(verbose)
     if not sequence and (sequences is not None or fps is not None):
         raise ConfigError(f"--{'fps' if sequences is None else 'sequences'}: only sequences have it; add --sequence")
     if objects_per_frame is not None:
@@ -92,7 +90,7 @@ def bop(
     meshes, assets = sources.meshes(), sources.assets()
     infos = sources.infos(meshes)
     total = sum(count for _, count in plan.scenes())
-    with stoppable(out), progress_bar(quiet) as bar:
+    with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("frames", total=total)
         dataset_writer.write_dataset(
             out,

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, stoppable
+from synthgen.cli.options import resumable
 
 
 @click.command()
@@ -79,7 +80,7 @@ def cut(
     planned = cut_plan.plan(images, config, hypotheses)
     for reason, count in sorted(planned.left_out.items()):
         click.echo(f"{images.split_path}: left out: {count} {reason}", err=True)
-    with lock.held(out), stoppable(out):
+    with lock.held(out), resumable(out):
         writer = ShardWriter.create(out, cut_plan.make_card(images, planned, config, drawn=hypotheses is None))
         missing = planned.n - len(writer.committed()) * config.shard_size
         size = estimated_bytes(config.patch_px, config.contour_points, max(0, missing))

@@ -3,8 +3,7 @@
 from pathlib import Path
 
 import click
-
-from synthgen.cli.console import progress_bar
+from posecore.command_line import progress_bar
 
 
 @click.command()

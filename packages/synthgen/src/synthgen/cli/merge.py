@@ -1,8 +1,9 @@
 """`synthgen merge`."""
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, stoppable
+from synthgen.cli.options import resumable
 
 
 @click.command()
@@ -28,7 +29,7 @@ def merge(datasets: tuple[str, ...], out: str, quiet: bool) -> None:
 
     parts = open_parts(datasets)
     card = merged_card(parts)
-    with lock.held(out), stoppable(out), progress_bar(quiet) as bar:
+    with lock.held(out), resumable(out), progress_bar(quiet) as bar:
         writer = ShardWriter.create(out, card)
         task = bar.add_task("pairs", total=card["n"])
         write_merged(parts, writer, lambda count: bar.advance(task, count))

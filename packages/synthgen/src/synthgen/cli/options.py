@@ -2,10 +2,12 @@
 
 import functools
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+from posecore.command_line import stoppable, verbose_option
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -103,9 +105,14 @@ def scene_options(command: F) -> F:
             "--skip-bad-objects", is_flag=True, help="Leave out objects that cannot be loaded, with a line for each."
         ),
         click.option("--quiet", is_flag=True, help="No progress bar."),
-        click.option("--verbose", is_flag=True, help="Log details to stderr."),
+        verbose_option("synthgen"),
     ]
     wrapped: Any = with_sources
     for option in reversed(options):
         wrapped = option(wrapped)
     return wrapped
+
+
+def resumable(out: str) -> AbstractContextManager[None]:
+    """End Ctrl-C with one line: what was rendered stays, and the command continues it."""
+    return stoppable(lambda: f"what is rendered stays in {out}; the same command again continues")

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from posecore.command_line import progress_bar
 
-from synthgen.cli.console import progress_bar, start_logging, stoppable
-from synthgen.cli.options import ENGINES, scene_options
+from synthgen.cli.options import ENGINES, resumable, scene_options
 
 if TYPE_CHECKING:
     from posecore.shard import Encoded
@@ -66,7 +66,6 @@ def render(
     preset: str,
     overrides: tuple[str, ...],
     quiet: bool,
-    verbose: bool,
     workers: int | None,
     scheduler: str | None,
     shard_timeout: float | None,
@@ -102,7 +101,6 @@ def render(
         )
     if save is not None and only is None:
         raise click.UsageError("--save writes the sample of --only: give that too")
-    start_logging(verbose)
     config, gpus = _with_device(load_config(preset, overrides, values), scheduler)
     meshes, assets = sources.meshes(), sources.assets()
     card = data_card.make_card(config, n, meshes, assets)
@@ -112,7 +110,7 @@ def render(
         _one_sample(out, ShardJob(config=config, card=card, meshes=meshes, assets=assets, threads=cores), only, save)
         return
     new = "://" not in out and not Path(out).exists()
-    with lock.held(out), stoppable(out), _leaving_nothing_useless(Path(out) if new else None):
+    with lock.held(out), resumable(out), _leaving_nothing_useless(Path(out) if new else None):
         writer = ShardWriter.create(out, card)
         for key, data in data_card.model_files(meshes, sources.infos(meshes)).items():
             writer.add_file(key, data)

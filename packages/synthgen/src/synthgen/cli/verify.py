@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-
-from synthgen.cli.console import progress_bar
+from posecore.command_line import progress_bar
 
 if TYPE_CHECKING:
     from synthgen.verify.findings import Finding, Report

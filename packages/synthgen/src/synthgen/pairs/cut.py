@@ -228,7 +228,7 @@ class _Patches:
         wanted = {pair.gt.gt_index for pair in image.pairs}
         front, hidden = np.zeros((height, width), bool), {}
         for index, gt in enumerate(image.annotated):
-            found = self._dataset.mask_and_place(scene_id, im_id, gt.gt_index, "mask_visib")
+            found = self._dataset.mask_and_location(scene_id, im_id, gt.gt_index, "mask_visib")
             seen, place = (drawn.instance == index, "") if found is None else found
             if seen.shape != front.shape:
                 raise DatasetError(

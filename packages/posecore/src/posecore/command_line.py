@@ -1,0 +1,149 @@
+"""Parts that the command lines of all programs share; the extra `posecore[cli]` installs click and rich.
+
+Errors of the project end a command in one line on stderr with an exit code. Logging and progress go to stderr too.
+"""
+
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+
+import click
+
+from posecore.errors import PoseError, exit_code
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+F = TypeVar("F", bound=Callable[..., Any])
+CONTEXT_SETTINGS: Mapping[str, Any] = {
+    "help_option_names": ["-h", "--help"],
+    "show_default": True,
+    "max_content_width": 110,
+}
+"""For the group of each program."""
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as of a shell."""
+
+
+class ErrorReportingGroup(click.Group):
+    """Group that reports `PoseError` and `OSError` in one line on stderr with an exit code, without a traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except PoseError as error:
+            click.echo(f"Error: {error}", err=True)
+            ctx.exit(exit_code(error))
+        except BrokenPipeError:  # `| head` has read enough: click ends quietly
+            raise
+        except OSError as error:
+            from posecore.files import storage_error
+
+            click.echo(f"Error: {storage_error(error.filename or 'storage', error)}", err=True)
+            ctx.exit(1)
+
+
+def start_logging(package: str, verbose: bool) -> None:
+    """Log to stderr: warnings; of this package and posecore also details if `verbose`."""
+    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    for name in (package, "posecore"):
+        logging.getLogger(name).setLevel(logging.INFO if verbose else logging.WARNING)
+
+
+def verbose_option(package: str) -> Callable[[F], F]:
+    """The option `--verbose` of a command, which starts the logging; the command has no parameter for it."""
+
+    def start(ctx: click.Context, _: click.Parameter, verbose: bool) -> None:
+        if not ctx.resilient_parsing:
+            start_logging(package, verbose)
+
+    return click.option("--verbose", is_flag=True, expose_value=False, callback=start, help="Log details to stderr.")
+
+
+def renamed_options(renamed: Mapping[str, str]) -> Callable[[F], F]:
+    """Refuse options of earlier versions, with or without a value: "--sure is now --tracking-threshold".
+
+    Args:
+        renamed: New name, or what else replaces it, by old name.
+    """
+
+    def refuse(ctx: click.Context, option: click.Parameter, value: str | None) -> None:
+        if value is not None and not ctx.resilient_parsing:
+            raise click.UsageError(f"{option.opts[0]} is now {renamed[option.opts[0]]}", ctx)
+
+    def decorate(command: F) -> F:
+        for number, old in enumerate(renamed):
+            command = click.option(
+                old, f"renamed_{number}", is_flag=False, flag_value="", is_eager=True, hidden=True,
+                expose_value=False, callback=refuse,
+            )(command)  # fmt: skip
+        return command
+
+    return decorate
+
+
+@contextmanager
+def stoppable(kept: Callable[[], str | None]) -> Iterator[None]:
+    """End Ctrl-C with one line and exit code 130.
+
+    Args:
+        kept: What remains on the disk and where, for this line; None if nothing does.
+    """
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        end_early(interrupt, kept())
+
+
+def end_early(stopped: BaseException, kept: str | None) -> NoReturn:
+    """End an interruption with exit code 130, or with the error; one line before names what was kept, if anything."""
+    is_interrupted = isinstance(stopped, KeyboardInterrupt)
+    if kept is not None or is_interrupted:
+        click.echo(f"Stopped: {kept or 'nothing was finished, nothing is written'}", err=True)
+    if is_interrupted:
+        raise SystemExit(INTERRUPTED) from None
+    raise stopped
+
+
+def progress_bar(quiet: bool, *extra: str) -> "Progress":
+    """A bar on stderr with count, rate, elapsed and remaining time.
+
+    Args:
+        quiet: Whether nothing is shown.
+        extra: More columns at its end, in rich's format strings, such as `{task.fields[state]}`.
+    """
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.text import Text
+
+    class Rate(ProgressColumn):
+        """Items a second."""
+
+        def render(self, task: Task) -> Text:
+            return Text(f"{task.speed:.2f}/s" if task.speed else "-/s")
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        Rate(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        *map(TextColumn, extra),
+        console=Console(stderr=True),
+        disable=quiet,
+        speed_estimate_period=120,
+    )

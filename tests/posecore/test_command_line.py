@@ -1,0 +1,139 @@
+"""Parts that the programs' command lines share."""
+
+import importlib
+import logging
+
+import click
+import pytest
+from click.testing import CliRunner
+from posecore.command_line import (
+    CONTEXT_SETTINGS,
+    ErrorReportingGroup,
+    end_early,
+    progress_bar,
+    renamed_options,
+    stoppable,
+    verbose_option,
+)
+from posecore.errors import ConfigError, ShardError
+
+
+@click.group(cls=ErrorReportingGroup, context_settings=CONTEXT_SETTINGS)
+def main():
+    """Program of one test."""
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, arguments)
+
+
+def raising(error):
+    group = ErrorReportingGroup("main")
+
+    @group.command()
+    def work():
+        raise error
+
+    return CliRunner().invoke(group, ["work"])
+
+
+@pytest.mark.parametrize("program", ["synthgen", "refinenet", "evalkit"])
+def test_every_program_reports_errors_this_way(program):
+    group = importlib.import_module(f"{program}.cli").main
+    assert type(group) is ErrorReportingGroup
+    assert group.context_settings == CONTEXT_SETTINGS
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    """`evalkit tables | head` closes the pipe."""
+    result = raising(BrokenPipeError(32, "Broken pipe"))
+    assert (result.exit_code, result.stderr) == (1, "")
+
+
+@pytest.mark.parametrize(
+    ("error", "line", "code"),
+    [
+        (ConfigError("n is 0"), "Error: n is 0\n", 2),
+        (ShardError("broken"), "Error: broken\n", 1),
+        (PermissionError(13, "Permission denied", "a/b"), "Error: a/b: no permission to write here", 1),
+    ],
+)
+def test_errors_are_one_line_and_an_exit_code(error, line, code):
+    result = raising(error)
+    assert result.stderr.startswith(line)
+    assert result.stderr.count("\n") == 1
+    assert (result.exit_code, result.stdout) == (code, "")
+
+
+@main.command()
+@renamed_options({"--sure": "--tracking-threshold", "--quick": "--fast"})
+@click.option("--tracking-threshold", type=float, required=True)
+@click.option("--fast", is_flag=True)
+def track(tracking_threshold, fast):
+    click.echo(f"{tracking_threshold} {fast}")
+
+
+@pytest.mark.parametrize("arguments", [["--sure", "0.5"], ["--sure=0.5"], ["--sure"]])
+def test_a_renamed_option_is_refused_with_its_new_name(arguments):
+    result = run("track", *arguments)
+    assert result.exit_code == 2
+    assert "Error: --sure is now --tracking-threshold\n" in result.stderr
+
+
+def test_a_renamed_flag_too_and_neither_is_in_the_help():
+    assert "--quick is now --fast" in run("track", "--tracking-threshold", "1", "--quick").stderr
+    help_text = run("track", "-h").stdout
+    assert "--fast" in help_text
+    assert "--sure" not in help_text
+    assert "--quick" not in help_text
+    assert run("track", "--tracking-threshold", "1", "--fast").stdout == "1.0 True\n"
+
+
+@main.command()
+@verbose_option("a_program")
+def log():
+    logging.getLogger("a_program.part").info("a detail")
+    logging.getLogger("a_library").info("a detail of another")
+
+
+def test_verbose_shows_details_of_the_program_alone(caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("a_program"), "level", 0)
+    assert run("log").exit_code == 0
+    assert caplog.messages == []
+    assert run("log", "--verbose").exit_code == 0
+    assert caplog.messages == ["a detail"]
+
+
+def test_evalkit_refuses_verbose_before_the_command():
+    result = CliRunner().invoke(importlib.import_module("evalkit.cli").main, ["-v", "report"])
+    assert result.exit_code == 2
+    assert "-v is now --verbose after the command" in result.stderr
+
+
+@main.command()
+@click.option("--kept")
+def stop(kept):
+    with stoppable(lambda: kept):
+        raise KeyboardInterrupt
+
+
+def test_an_interruption_ends_with_one_line():
+    result = run("stop", "--kept", "it is in out")
+    assert (result.exit_code, result.stderr) == (130, "Stopped: it is in out\n")
+    assert run("stop").stderr == "Stopped: nothing was finished, nothing is written\n"
+
+
+def test_an_error_that_ends_early_stays_itself(capsys):
+    with pytest.raises(ShardError, match="broken"):
+        end_early(ShardError("broken"), "half of it is in out")
+    assert capsys.readouterr().err == "Stopped: half of it is in out\n"
+    with pytest.raises(ShardError):
+        end_early(ShardError("broken"), None)
+    assert capsys.readouterr().err == ""
+
+
+def test_the_bar_has_more_columns_at_its_end():
+    bar = progress_bar(True, "{task.fields[state]}")
+    bar.add_task("pairs", total=3, state="loss 0.1")
+    cells = [column.render(bar.tasks[0]) for column in bar.columns if hasattr(column, "text_format")]
+    assert [cell.plain for cell in cells] == ["pairs", "left", "loss 0.1"]
