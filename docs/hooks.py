@@ -1,9 +1,12 @@
 """Pages that are made from the project itself when the documentation is built, so that they cannot fall behind it."""
 
+import dataclasses
 import html
 import importlib
 import inspect
 import re
+import sys
+import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +16,9 @@ import yaml
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import drawings
 
 ROOT = Path(__file__).resolve().parent.parent
 PROGRAMS = ("synthgen", "refinenet", "evalkit")
@@ -25,6 +31,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
         "data-format.md": data_format_page(),
         "cli.md": cli_page(),
+        "training-keys.md": training_keys_page(),
     }
     for name, content in pages.items():
         files.append(File.generated(config, name, content=content))
@@ -32,8 +39,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Put the table of checks where a page asks for it (called by mkdocs)."""
-    return markdown.replace("<!-- checks -->", checks_table())
+    """Insert the table of checks and the drawings (called by mkdocs)."""
+    return drawings.draw(markdown.replace("<!-- checks -->", checks_table()))
 
 
 def checks_table() -> str:
@@ -72,6 +79,53 @@ def cli_page() -> str:
             lines += [f"{'#' * min(2 + name.count(' '), 4)} {name}", "", *_help_text(command), ""]
             lines += [*_parameters(command), ""]
     return "\n".join(lines)
+
+
+def training_keys_page() -> str:
+    """Return every key of a training configuration, from the dataclasses and their docstrings."""
+    config = importlib.import_module("refinenet.config.train")
+    lines = [
+        "# Training keys",
+        "",
+        "`--set key=value` changes one key of a preset, `--config FILE` several. Below are the defaults of the "
+        "configuration classes; presets override some. The resolved configuration is written beside every checkpoint.",
+        "",
+    ]
+    return "\n".join([*lines, *_key_tables(config.TrainConfig, "")])
+
+
+def _key_tables(kind: type, prefix: str) -> list[str]:
+    """Markdown tables of a configuration class: its plain keys, then one section for each nested class."""
+    docs, types = _attribute_docs(kind), typing.get_type_hints(kind)
+    rows: list[str] = []
+    sections: list[str] = []
+    for field in dataclasses.fields(kind):
+        nested = next(filter(dataclasses.is_dataclass, [types[field.name], *typing.get_args(types[field.name])]), None)
+        if nested is not None:
+            sections += ["", f"## {prefix}{field.name}", "", *_key_tables(nested, f"{prefix}{field.name}.")]
+        else:
+            default = field.default_factory() if callable(field.default_factory) else field.default
+            shown = "" if default is dataclasses.MISSING else f"<code>{_cell(_yaml(default))}</code>"
+            rows.append(f"| `{prefix}{field.name}` | {shown} | {_sentence(docs.get(field.name, ''))} |")
+    return ["| key | default | meaning |", "|---|---|---|", *rows, *sections]
+
+
+def _attribute_docs(kind: type) -> dict[str, str]:
+    """Texts of the `Attributes:` section of a docstring."""
+    section = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")[2]
+    return {name: " ".join(text.split()) for name, text in re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.M)}
+
+
+def _yaml(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return f"[{', '.join(map(_yaml, value))}]" if isinstance(value, list | tuple) else str(value) or '""'
+
+
+def _sentence(text: str) -> str:
+    """A docstring's text as a table cell: code stays code, the first letter is a capital."""
+    text = " ".join(text.split()).replace("|", "&#124;").replace("*", "&#42;")
+    return text[:1].upper() + text[1:]
 
 
 def _help_text(command: click.Command) -> list[str]:

@@ -254,7 +254,7 @@ def test_every_shard_field_is_documented() -> None:
 def test_written_commands_exist() -> None:
     """Commands in the README and the hand-written pages are commands that exist."""
     known = {name for name, _ in every_command()}
-    pages = [REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md"), *REPOSITORY.glob("packages/*/README.md")]
+    pages = [REPOSITORY / "README.md", *(REPOSITORY / "docs").rglob("*.md"), *REPOSITORY.glob("packages/*/README.md")]
     for page in pages:
         for call in re.findall(rf"^(?:    |`)?((?:{'|'.join(PROGRAMS)}) [a-z][a-z-]+)", page.read_text(), re.MULTILINE):
             assert call in known, f"{page.relative_to(REPOSITORY)} shows `{call}`"

@@ -94,13 +94,14 @@ def test_distances_follow_the_object_or_are_absolute():
 
 
 def test_every_key_stands_in_the_documentation_with_its_default(repository):
-    page = (repository / "docs" / "scenes.md").read_text(encoding="utf-8")
+    page = (repository / "docs" / "scene-keys.md").read_text(encoding="utf-8")
     config = config_tools.to_dict(SynthConfig())
     groups = {name: group for name, group in config.items() if isinstance(group, dict)}
     for name in groups.keys() - {"camera", "frames", "sequence"}:  # the last two are of whole images: docs/bop.md
         for key, value in groups[name].items():
             row = next((line for line in page.splitlines() if line.startswith(f"| `{name}.{key}` |")), None)
-            assert row is not None, f"{name}.{key} is not in docs/scenes.md"
+            assert row is not None, f"{name}.{key} is not in docs/scene-keys.md"
             assert yaml.safe_load(row.split("`")[3]) == value, row
+    presets = (repository / "docs" / "scenes.md").read_text(encoding="utf-8")
     for preset in preset_names():
-        assert f"`{preset}`" in page
+        assert f"| `{preset}` |" in presets

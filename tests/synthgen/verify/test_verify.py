@@ -336,7 +336,7 @@ def test_the_documentation_has_every_check(repository):
     spec = importlib.util.spec_from_file_location("docs_hooks", repository / "docs" / "hooks.py")
     hooks = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hooks)
-    assert "\n<!-- checks -->\n" in (repository / "docs" / "trust.md").read_text()
+    assert "\n<!-- checks -->\n" in (repository / "docs" / "verifying.md").read_text()
     rows = hooks.checks_table().splitlines()[2:]
     assert len(rows) == len(checks.CHECKS) + len(DATASET_CHECKS)
     for check, row in zip(checks.CHECKS, rows[len(DATASET_CHECKS) :], strict=True):
