@@ -1,4 +1,4 @@
-"""Plain numpy twin of the rasteriser: slow, obvious, what tests hold the GL one against."""
+"""Reference implementation of the rasteriser in numpy: slow and obvious; tests compare the GL one with it."""
 
 import numpy as np
 from jaxtyping import Bool, Float
