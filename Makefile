@@ -58,7 +58,7 @@ format: $(SETUP) ## Format the code and mend what lint can mend
 	$(BIN)/ruff format .
 
 docs: $(SETUP) ## The documentation, into site/
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 objects: $(SETUP) ## The example objects, from their script
 	$(BIN)/python examples/objects/make_objects.py
