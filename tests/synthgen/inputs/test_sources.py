@@ -153,6 +153,14 @@ def test_symmetries_are_found_by_name_or_id(tug, tmp_path):
         load_symmetries(tmp_path / "none.json", {1: tug})
 
 
+def test_a_key_that_is_an_id_and_a_file_name_is_a_file_name(tug, tmp_path):
+    file = tmp_path / "models_info.json"
+    turn = [-1, 0, 0, 0, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    file.write_text(json.dumps({"2": {"diameter": 118.9, "symmetries_discrete": [turn]}, "3": {"diameter": 118.9}}))
+    infos = load_symmetries(file, {1: replace(tug, path="2.ply"), 2: replace(tug, path="3.ply")})
+    assert {i: info.is_symmetric for i, info in infos.items()} == {1: True, 2: False}
+
+
 def test_object_ids_follow_bop_names_or_the_order():
     assert object_ids(["a.ply", "b.ply"]) == [1, 2]
     assert object_ids(["x/obj_000009.ply", "obj_000002.ply"]) == [9, 2]

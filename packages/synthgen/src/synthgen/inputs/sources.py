@@ -124,14 +124,16 @@ def object_ids(paths: Sequence[str]) -> list[int]:
 def load_symmetries(file: Path, meshes: Mapping[int, Mesh]) -> dict[int, ModelInfo]:
     """Symmetries of the objects from a `models_info.json` whose keys are object ids or the meshes' file names.
 
+    A key that is both, such as 2 for `2.ply` as the first object, is a file name.
+
     Raises:
         DatasetError: The file is missing or broken, or lists none of the objects.
     """
-    names = {obj_id: (str(obj_id), Path(mesh.path).stem) for obj_id, mesh in meshes.items()}
-    infos, listed = _listed_infos(file, names)
+    ids = {str(obj_id): obj_id for obj_id in meshes} | {Path(mesh.path).stem: i for i, mesh in meshes.items()}
+    content = read_json(file)
+    infos = {ids[key]: load_model_info(content[key], f"{file}, object {key}") for key in content if key in ids}
     if not infos:
-        keys = sorted({name for pair in names.values() for name in pair})
-        raise DatasetError(f"{file}: no entry for {', '.join(keys)}; its keys are {', '.join(listed)}")
+        raise DatasetError(f"{file}: no entry for {', '.join(sorted(ids))}; its keys are {', '.join(content)}")
     return infos
 
 
@@ -145,15 +147,8 @@ def info_beside(mesh_file: Path) -> ModelInfo | None:
     if not file.is_file():
         return None
     names = (mesh_file.stem, *(() if number is None else (str(number),)))
-    return _listed_infos(file, {0: names})[0].get(0)
-
-
-def _listed_infos(file: Path, names: Mapping[int, Sequence[str]]) -> tuple[dict[int, ModelInfo], list[str]]:
-    """Entries of a `models_info.json` by id, each under the first of its names, and the file's keys."""
     content = read_json(file)
-    keys = {obj_id: next((name for name in each if name in content), None) for obj_id, each in names.items()}
-    infos = {i: load_model_info(content[key], f"{file}, object {key}") for i, key in keys.items() if key is not None}
-    return infos, list(content)
+    return next((load_model_info(content[name], f"{file}, object {name}") for name in names if name in content), None)
 
 
 def _bop_number(path: Path) -> int | None:
