@@ -4,8 +4,11 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 
 import pytest
+from posecore import processes
 from posecore.errors import RenderError
 from posecore.processes import behave_as_worker, in_order, map_unordered, spawned, unordered
 
@@ -95,6 +98,27 @@ def test_processes_that_die_are_replaced_and_their_items_done_again(tmp_path):
     )
     assert sorted(results) == [(item, item.name) for item in sorted(items)]
     assert crashes == [True]
+
+
+@pytest.mark.parametrize("attempts", [1, 2])
+def test_processes_that_die_at_their_start_are_counted_too(monkeypatch, attempts):
+    crashes = []
+
+    @contextmanager
+    def dying_once(*settings):
+        with spawned(*settings) as pool:
+            if not crashes:
+                raise BrokenProcessPool
+            yield pool
+
+    monkeypatch.setattr(processes, "spawned", dying_once)
+    results = map_unordered(abs, [-1], 1, died=str, attempts=attempts, on_crash=lambda: crashes.append(1))
+    if attempts == 1:
+        with pytest.raises(RenderError, match=r"^a worker process died at its start$"):
+            list(results)
+    else:
+        assert list(results) == [(-1, 1)]
+    assert crashes == [1]
 
 
 def test_items_that_kill_every_process_end_the_run(tmp_path):

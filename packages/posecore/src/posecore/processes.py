@@ -145,21 +145,21 @@ def map_unordered(
     submitted: dict[int, T] = {}
     crashes = 0
     while True:
-        crash: BrokenProcessPool | None = None
-        with spawned(workers, start, arguments, "a worker process died") as pool:
-            again = tuple(sorted(submitted.items()))
-            try:
+        try:
+            with spawned(workers, start, arguments, "a worker process died at its start") as pool:
+                again = tuple(sorted(submitted.items()))
                 for number, result in _finished(pool, job, chain(again, numbered), submitted, ahead * workers):
                     crashes = 0
                     yield submitted.pop(number), result
-            except BrokenProcessPool as error:
-                crash = error
-        if crash is None:
             return
+        except RenderError as error:
+            if not isinstance(error.__cause__, BrokenProcessPool):
+                raise
+            crash = error
         crashes += 1
         on_crash()
         if crashes == attempts:
-            raise RenderError(died(submitted[min(submitted)])) from crash
+            raise RenderError(died(submitted[min(submitted)]) if submitted else str(crash)) from crash.__cause__
 
 
 def _finished(
