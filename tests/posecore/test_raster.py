@@ -236,6 +236,15 @@ def test_object_behind_the_camera_is_not_drawn(rasteriser: Rasteriser) -> None:
     assert not rasteriser.render(1, K, T, 140, 100).mask.any()
 
 
+def test_a_table_whose_centre_is_behind_the_camera_is_drawn_to_its_end() -> None:
+    near, table = np.eye(4), np.eye(4)
+    near[2, 3], table[:3, 3] = 0.4, [0.0, 0.1, -0.5]
+    instances = [Instance(obj_id=1, T_cam_obj=near), Instance(obj_id=2, T_cam_obj=table)]
+    with Rasteriser({1: BOX, 2: mesh_of(trimesh.creation.box((0.4, 0.02, 4.0)))}) as rasteriser:
+        layers = rasteriser.render_scene(instances, K, 140, 100)
+    assert layers.depth_m[layers.instance == 1].max() > 1.2
+
+
 def test_object_through_the_camera_plane_is_clipped_not_mirrored(rasteriser: Rasteriser) -> None:
     T = np.eye(4)
     T[2, 3] = 0.02

@@ -253,21 +253,18 @@ class Rasteriser:
         return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
 
     def _depth_range_m(self, instances: Sequence[Instance]) -> tuple[float, float]:
-        """Near and far plane: around all instances in front, no nearer than a twentieth of the nearest centre's depth.
+        """Near and far plane: around all instances, no nearer than a twentieth of the nearest depth of a centre in front.
 
         A 24-bit depth buffer keeps the order of surfaces that are `z^2 (far - near) / (near far 2^24)` apart: 1.2e-7
         diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8
         z.
         """
-        in_front = [
-            (z_m, self._mesh(instance.obj_id).diameter_m)
-            for instance in instances
-            if (z_m := self._center_z_m(instance)) > 0
-        ]
+        depths = [(self._center_z_m(instance), self._mesh(instance.obj_id).diameter_m) for instance in instances]
+        farthest_m = 1.01 * max((z_m + diameter_m for z_m, diameter_m in depths), default=1.0)
+        in_front = [(z_m, diameter_m) for z_m, diameter_m in depths if z_m > 0]
         if not in_front:
-            return 1e-3, 1.0
+            return 1e-3, max(1.0, farthest_m)  # a large object still reaches to the front
         nearest_m = 0.99 * min(z_m - diameter_m for z_m, diameter_m in in_front)
-        farthest_m = 1.01 * max(z_m + diameter_m for z_m, diameter_m in in_front)
         return max(nearest_m, 0.05 * min(z_m for z_m, _ in in_front)), farthest_m
 
     def _mesh(self, obj_id: int) -> Mesh:
