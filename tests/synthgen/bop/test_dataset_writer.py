@@ -179,6 +179,17 @@ def test_workers_make_the_same_bytes_and_one_that_is_killed_is_replaced(crowded,
     assert tree(tmp_path / "w") == tree(crowded)
 
 
+def test_workers_that_are_interrupted_leave_no_temporary_files(tmp_path, config_of, meshes):
+    def stop(scene_id, im_id):
+        (tmp_path / "w/.rgb.png.tmp").touch()
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_dataset(tmp_path / "w", config_of(*MANY), meshes, FramePlan(frames=5), workers=2, on_frame=stop)
+    assert not list((tmp_path / "w").rglob(".*.tmp"))
+    assert len(BopDataset(tmp_path / "w").im_ids(1)) == 1
+
+
 def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, tug_ply, bobbin_ply, config_of, meshes):
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"

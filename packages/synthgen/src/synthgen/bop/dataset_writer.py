@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import chain
@@ -32,6 +32,7 @@ from synthgen import lock
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig, migrate
 from synthgen.draw.target import TargetObject, make_targets
+from synthgen.engines.blender import scratch
 from synthgen.engines.blender.paths import forget_blenders_paths
 from synthgen.inputs.assets import Assets
 from synthgen.pairs.data_card import versions
@@ -208,17 +209,23 @@ def _rendered(job: FrameJob, addresses: Iterator[Address], workers: int) -> Gene
     if first is None:
         return
     if workers > 1:
-        yield from map_unordered(
-            _write,
-            chain((first,), addresses),
-            workers,
-            start=_start,
-            arguments=(job,),
-            died=_crash_message,
-            ahead=_AHEAD,
-            attempts=_CRASHES,
-            on_crash=partial(_sweep, job.root),
-        )
+        remove_leftovers = partial(_remove_leftovers, job.root)
+        try:
+            yield from map_unordered(
+                _write,
+                chain((first,), addresses),
+                workers,
+                start=_start,
+                arguments=(job,),
+                died=_crash_message,
+                ahead=_AHEAD,
+                attempts=_CRASHES,
+                on_crash=remove_leftovers,
+            )
+        except BaseException:
+            with suppress(OSError):
+                remove_leftovers()  # the processes were ended at once
+            raise
         return
     renderer = FrameRenderer(job)
     try:
@@ -273,6 +280,12 @@ def _sweep(folder: Path) -> None:
     """Remove temporary files of interrupted writes."""
     for leftover in folder.rglob(".*.tmp"):
         leftover.unlink(missing_ok=True)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what killed processes leave: the renderers' folders and temporary files."""
+    scratch.sweep()
+    _sweep(folder)
 
 
 def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], plan: FramePlan, assets: Assets) -> None:
