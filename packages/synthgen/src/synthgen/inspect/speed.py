@@ -103,8 +103,8 @@ def measure_engine(
     return EngineSpeed(engine=engine, measured=measured)
 
 
-class _TimeIsUp(Exception):
-    """Ends a measured run."""
+class _TimeIsUp(BaseException):
+    """Ends a measured run; no handler of errors that it interrupts may keep it."""
 
 
 def measure_run(job: RenderJob, seconds: float) -> RunEstimate | None:
@@ -127,6 +127,7 @@ def measure_run(job: RenderJob, seconds: float) -> RunEstimate | None:
     signal.setitimer(signal.ITIMER_REAL, seconds + _START_S)
     with suppress(_TimeIsUp):
         render_dataset(job, on_shard=on_shard)
+    signal.setitimer(signal.ITIMER_REAL, 0)
     if len(commits) < 2:
         return None
     lines = [encoded.line for _, encoded in commits]
