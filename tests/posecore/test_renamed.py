@@ -36,6 +36,30 @@ def test_posecore_names_the_new_place_of_what_its_pages_showed():
     assert "ImportError: posecore.raster_reference is now posecore.raster.reference" in ended.stderr
 
 
+REFUSALS = """
+import importlib, pkgutil, sys
+import evalkit, posecore, refinenet, synthgen
+from posecore.renamed import _RenamedModules
+
+table = next(finder for finder in sys.meta_path if isinstance(finder, _RenamedModules)).renamed
+for old, new in table.items():
+    for name in new.split(" and "):
+        pkgutil.resolve_name(name)
+    try:
+        importlib.import_module(old)
+    except ImportError as error:
+        assert str(error) == f"{old} is now {new}", error
+    else:
+        raise AssertionError(old)
+print(*sorted({old.partition(".")[0] for old in table}))
+"""
+
+
+def test_every_module_that_is_refused_has_a_new_name_that_exists():
+    ended = subprocess.run([sys.executable, "-c", REFUSALS], capture_output=True, text=True)
+    assert ended.stdout == "evalkit posecore refinenet synthgen\n", ended.stderr
+
+
 @pytest.mark.parametrize(
     ("stored", "expected"),
     [

@@ -6,4 +6,14 @@ OpenCV camera axes, pixel centres at +0.5.
 
 from posecore.renamed import refuse_renamed_modules
 
-refuse_renamed_modules({"posecore.raster_reference": "posecore.raster.reference"})
+refuse_renamed_modules(
+    {
+        "posecore.bop.Target": "posecore.bop.BopTarget",
+        "posecore.bop.stored": "posecore.bop.file_slice",
+        "posecore.bop.table_of": "posecore.bop.estimate_table",
+        "posecore.compiled": "posecore.numba_jit",
+        "posecore.raster_reference": "posecore.raster.reference",
+        "posecore.shard.files": "posecore.shard.sharding_codec",
+        "posecore.shard.group": "posecore.shard.layout",
+    }
+)
