@@ -253,7 +253,7 @@ class Rasteriser:
         return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
 
     def _depth_range_m(self, instances: Sequence[Instance]) -> tuple[float, float]:
-        """Near and far plane: around all instances, no nearer than a twentieth of the nearest depth of a centre in front.
+        """Near and far plane: around all instances, no nearer than a twentieth of the depth of the nearest centre.
 
         A 24-bit depth buffer keeps the order of surfaces that are `z^2 (far - near) / (near far 2^24)` apart: 1.2e-7
         diameters for one object, 1.2e-6 z for one that is 20 times as far as the nearest. Coordinates are float32: 6e-8
