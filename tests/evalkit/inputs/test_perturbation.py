@@ -2,13 +2,15 @@
 
 import json
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from evalkit.cli import main
-from evalkit.inputs.perturbation import PROTOCOLS, protocol_deviations
+from evalkit.inputs.perturbation import PROTOCOLS, PerturbJob, protocol_deviations
 from posecore.bop import BopDataset, read_results, read_sidecar
+from posecore.errors import ConfigError
 
 
 def perturb(*arguments):
@@ -91,3 +93,8 @@ def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(
     without = perturb("--dataset", dataset_path, "--out", tmp_path / "x.csv", "--angles", "5", "--depth-stretch", "4")
     assert without.exit_code == 2
     assert without.stderr == "Error: --depth-stretch needs a random initial pose; give --random-translation too\n"
+
+
+def test_an_unknown_protocol_is_refused():
+    with pytest.raises(ConfigError, match=r"protocol: got 'cvpr', expected one of .*paper"):
+        PerturbJob(dataset=Path("dataset"), out=Path("initial.csv"), protocol="cvpr")

@@ -70,6 +70,8 @@ class PerturbJob:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.protocol is not None and self.protocol not in PROTOCOLS:
+            raise ConfigError(f"protocol: got {self.protocol!r}, expected one of {', '.join(PROTOCOLS)}")
         if self.protocol is not None and (self.angles_deg or self.translations_diameter):
             raise ConfigError(
                 f"--protocol {self.protocol} brings its own levels; leave --angles and --translations away"
