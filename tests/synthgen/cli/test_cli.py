@@ -4,6 +4,7 @@ import re
 import pytest
 from click.testing import CliRunner
 from synthgen.cli import main
+from synthgen.cli.options import resumable
 
 
 def invoke(*arguments):
@@ -137,3 +138,13 @@ def test_an_export_that_would_replace_something_says_so_at_once(tmp_path):
     assert result.exit_code == 1
     assert "add --overwrite to replace it" in error_line(result)
     assert there.read_text() == "mine"
+
+
+@pytest.mark.parametrize(("exists", "line"), [(True, "what is rendered stays in"), (False, "nothing is written")])
+def test_an_interruption_names_only_a_folder_that_exists(tmp_path, capsys, exists, line):
+    if exists:
+        (tmp_path / "shards").mkdir()
+    with pytest.raises(SystemExit) as ended, resumable(str(tmp_path / "shards")):
+        raise KeyboardInterrupt
+    assert ended.value.code == 130
+    assert line in capsys.readouterr().err

@@ -113,5 +113,11 @@ def scene_options(command: F) -> F:
 
 
 def resumable(out: str) -> AbstractContextManager[None]:
-    """End Ctrl-C with one line: finished parts stay in `out`, and the same command continues there."""
-    return stoppable(lambda: f"what is rendered stays in {out}; the same command again continues")
+    """End Ctrl-C with one line: what is in `out` by then, if anything, stays, and the same command continues there."""
+
+    def kept() -> str | None:
+        if "://" not in out and not Path(out).exists():
+            return None
+        return f"what is rendered stays in {out}; the same command again continues"
+
+    return stoppable(kept)
