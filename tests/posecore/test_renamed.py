@@ -92,5 +92,5 @@ def test_sidecars_of_the_version_before_are_read_as_new_ones(tmp_path):
     assert read_sidecar(tmp_path / "r.csv") == {
         "method": "initial",
         "initial_lines": [2, 3],
-        "settings": {"tracking_threshold": 0.5, "reacquire_threshold": 0.2, "seed": 1},
+        "settings": {"tracking_threshold": 0.5, "accept_threshold": 0.2, "seed": 1},
     }

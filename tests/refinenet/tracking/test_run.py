@@ -29,7 +29,7 @@ def test_a_job_writes_the_files_of_the_command(cli, job, tmp_path):
     assert columns(job.out) == columns(out)
     assert read_sidecar(job.out) == read_sidecar(out)
     settings = read_sidecar(out)["settings"]
-    assert (settings["tracking_threshold"], settings["reacquire_threshold"]) == (0.35, 0.2)
+    assert (settings["tracking_threshold"], settings["accept_threshold"]) == (0.35, 0.2)
 
 
 def test_an_early_end_keeps_the_finished_frames(job):
@@ -55,7 +55,7 @@ def test_settings_without_effect_are_refused(job):
         TrackJob(method=search, init=job.init, **common)
 
 
-@pytest.mark.parametrize(("old", "new"), [("--sure", "--tracking-threshold"), ("--found", "--reacquire-threshold")])
+@pytest.mark.parametrize(("old", "new"), [("--sure", "--tracking-threshold"), ("--found", "--accept-threshold")])
 def test_old_options_are_refused_with_the_new_name(cli, job, old, new):
     result = cli("track", job.source, "--init", job.init, "--out", job.out, old, 0.5)
     assert result.exit_code == 2

@@ -20,7 +20,7 @@ from refinenet.tracking.tracker import ObjectTrack, Tracker
 
 from ..conftest import K
 
-CONFIG = TrackingConfig(tracking_threshold=0.6, reacquire_threshold=0.4, patience=3, depth_step=0.0)
+CONFIG = TrackingConfig(tracking_threshold=0.6, accept_threshold=0.4, patience=3, depth_step=0.0)
 T, U, L = TrackState.TRACKING, TrackState.UNCERTAIN, TrackState.LOST
 EMPTY = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
 
@@ -51,7 +51,7 @@ def test_states(confidences, states):
 
 def test_thresholds_must_be_in_order():
     for wrong in (
-        {"tracking_threshold": 0.3, "reacquire_threshold": 0.4},
+        {"tracking_threshold": 0.3, "accept_threshold": 0.4},
         {"patience": 0},
         {"depth_step": 0.5},
         {"tracking_threshold": 1.1},
@@ -208,7 +208,7 @@ def test_a_depth_is_left_only_for_one_that_is_clearly_better():
 
 def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
     track = ObjectTrack(
-        obj_id=1, config=TrackingConfig(tracking_threshold=0.0, reacquire_threshold=0.0, patience=2, depth_step=0.0)
+        obj_id=1, config=TrackingConfig(tracking_threshold=0.0, accept_threshold=0.0, patience=2, depth_step=0.0)
     )
     for frame, (status, state) in enumerate([(Status.STOPPED, T), (Status.FAILED, U), (Status.FAILED, L)]):
         track.hypotheses(frame, [pose(0)])

@@ -243,9 +243,9 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([tmp_path / "empty", *pose, *camera], 1, "no images"),
         ([tmp_path / "no.mp4", *pose, *camera], 1, "cannot open it as a video"),
         (
-            [root, *init, "--tracking-threshold", 0.2, "--reacquire-threshold", 0.4],
+            [root, *init, "--tracking-threshold", 0.2, "--accept-threshold", 0.4],
             2,
-            "expected 0 <= reacquire_threshold <= tr",
+            "expected 0 <= accept_threshold <= tr",
         ),
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
@@ -297,7 +297,7 @@ def test_search_is_asked_for_what_is_found(cli, scene, tmp_path, monkeypatch):
     root, _ = scene
     out = tmp_path / "track.csv"
     options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--tracking-threshold", 0.2]
-    assert cli("track", root, *options, "--reacquire-threshold", 0.1).exit_code == 0
+    assert cli("track", root, *options, "--accept-threshold", 0.1).exit_code == 0
     assert set(asked) == {0.1}
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
 

@@ -8,8 +8,6 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorColumn:
@@ -75,12 +73,12 @@ RENAMED_COLUMNS: Mapping[str, str] = {
 """New name of columns that error tables of earlier versions have under another one."""
 
 
-def table_of(columns: Mapping[str, Sequence[Any] | Array]) -> pd.DataFrame:
+def table_of(columns: Mapping[str, Sequence[Any] | np.ndarray]) -> pd.DataFrame:
     """A table from its columns, all of `COLUMNS` and maybe others (VSD's); an empty one from none."""
     table = pd.DataFrame(dict(columns) if columns else {name: [] for name in COLUMNS})
     return table.astype({name: column.dtype for name, column in COLUMNS.items()})
 
 
-def column(table: pd.DataFrame, name: str) -> Float[Array, " n"]:
+def column(table: pd.DataFrame, name: str) -> Float[np.ndarray, " n"]:
     """One column as float64; booleans are 0 and 1."""
     return np.asarray(table[name].to_numpy(), dtype=np.float64)

@@ -18,7 +18,6 @@ from posecore.errors import DatasetError
 
 from evalkit.check.findings import Findings, Level
 
-Array = np.ndarray
 Image = tuple[int, int]
 KINDS: tuple[Kind, ...] = ("camera", "gt", "gt_info")
 ROUGH_ROTATION = 1e-3
@@ -41,7 +40,7 @@ class Scenes:
     images: list[Image] = field(default_factory=list)
     instances: dict[Image, list[GroundTruth]] = field(default_factory=dict)
     instance_counts: dict[Image, Counter[int]] = field(default_factory=dict)
-    matrices: dict[Image, Float[Array, "3 3"]] = field(default_factory=dict)
+    matrices: dict[Image, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
 
 def check_scenes(dataset: BopDataset, infos: Mapping[int, ModelInfo], findings: Findings) -> Scenes:
@@ -138,7 +137,7 @@ def _check_camera(entry: Any, where: str, image: Image, scenes: Scenes, findings
                 findings.add("warning", "camera", where, "'cam_R_w2c' is not a rotation (9 numbers by rows)")
 
 
-def check_camera_size(K: Float[Array, "3 3"], size: tuple[int, int], where: str, findings: Findings) -> None:
+def check_camera_size(K: Float[np.ndarray, "3 3"], size: tuple[int, int], where: str, findings: Findings) -> None:
     """Check a camera matrix against its image's width and height."""
     width, height = size
     focal = float(K[0, 0]) / max(width, height)

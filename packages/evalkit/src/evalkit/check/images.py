@@ -14,7 +14,6 @@ from posecore.errors import DatasetError
 from evalkit.check.annotations import Image, Scenes, check_camera_size
 from evalkit.check.findings import Findings
 
-Array = np.ndarray
 Size = tuple[int, int]
 MASK_KINDS: tuple[MaskKind, ...] = ("mask", "mask_visib")
 CLEARLY_VISIBLE = 0.3
@@ -107,8 +106,8 @@ def _check_on_image(
 
 
 def off_image_px(
-    T_cam_obj: Float[Array, "n 4 4"], K: Float[Array, "3 3"], size: Size, reach_m: Float[Array, " n"]
-) -> Float[Array, " n"]:
+    T_cam_obj: Float[np.ndarray, "n 4 4"], K: Float[np.ndarray, "3 3"], size: Size, reach_m: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """Distance of objects from the image in pixels, 0 where they may touch it.
 
     Args:
@@ -158,10 +157,10 @@ def _check_depth(
 
 def _check_depth_scale(
     where: str,
-    depth_m: Float[Array, "h w"],
+    depth_m: Float[np.ndarray, "h w"],
     scale: float,
     instances: list[GroundTruth],
-    K: Float[Array, "3 3"],
+    K: Float[np.ndarray, "3 3"],
     findings: Findings,
 ) -> None:
     ratios = []

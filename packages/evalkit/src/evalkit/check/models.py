@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from evalkit.check.findings import Findings, Level
 
-Array = np.ndarray
 DIAMETER_TOLERANCE = 5e-3
 """Largest relative difference of `models_info.json`'s diameter from the mesh beside the file."""
 EVAL_DIAMETER_TOLERANCE = 2e-2
@@ -154,7 +153,7 @@ def _check_symmetries(file: Path, obj_id: int, mesh: Mesh, info: ModelInfo, find
             )
 
 
-def _symmetries(info: ModelInfo) -> Iterator[tuple[str, Float[Array, "n 4 4"]]]:
+def _symmetries(info: ModelInfo) -> Iterator[tuple[str, Float[np.ndarray, "n 4 4"]]]:
     for index, transform in enumerate(info.symmetries_discrete):
         yield f"symmetries_discrete {index}", transform[None]
     angles = np.arange(1, TURNS + 1) * (2 * np.pi / (TURNS + 1))
@@ -162,7 +161,7 @@ def _symmetries(info: ModelInfo) -> Iterator[tuple[str, Float[Array, "n 4 4"]]]:
         yield f"symmetries_continuous {index}", rotations_about_axis(np.array(axis), angles, np.array(offset_m))
 
 
-def surface_points(mesh: Mesh, count: int) -> Float[Array, "n 3"]:
+def surface_points(mesh: Mesh, count: int) -> Float[np.ndarray, "n 3"]:
     """Points spread evenly over a surface, metres; the same at every call."""
     corners = mesh.vertices_m[mesh.faces]
     areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

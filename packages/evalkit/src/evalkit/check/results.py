@@ -16,7 +16,6 @@ from evalkit.check.annotations import ROUGH_ROTATION
 from evalkit.check.findings import Findings
 from evalkit.check.images import off_image_px
 
-Array = np.ndarray
 TIME_TOLERANCE_S = 1e-3
 """Largest difference between an image's times that bop_toolkit accepts."""
 _NAME = re.compile(r"[^_]+_(?P<dataset>[^_-]+)-(?P<split>[^_-]+)(-[^_-]+)?(_.+)?\.csv")
@@ -157,7 +156,7 @@ def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings:
 
 
 def _check_poses(
-    path: Path, table: ResultTable, is_valid: Bool[Array, " n"], dataset: BopDataset, findings: Findings
+    path: Path, table: ResultTable, is_valid: Bool[np.ndarray, " n"], dataset: BopDataset, findings: Findings
 ) -> None:
     """Poses behind the camera or outside the image."""
     behind = is_valid & (table.T_cam_obj[:, 2, 3] <= 0)

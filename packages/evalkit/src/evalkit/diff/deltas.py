@@ -16,7 +16,6 @@ from evalkit.scores.definitions import RECALL_DIAMETERS
 from evalkit.scores.failure_causes import causes
 from evalkit.scores.per_pose import solved
 
-Array = np.ndarray
 KEY = ["scene_id", "im_id", "obj_id", "gt_index"]
 LEVEL = ["initial_angle_deg", "initial_translation_diameter"]
 LEVEL_DECIMALS = 6
@@ -155,7 +154,7 @@ def differences(
     )
 
 
-def paired_rows(a: pd.DataFrame, b: pd.DataFrame) -> tuple[Int[Array, " p"], Int[Array, " p"]]:
+def paired_rows(a: pd.DataFrame, b: pd.DataFrame) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
     """Positions of the same expected poses in two tables, in the first's order.
 
     Equal poses have the same scene, image, object, instance and initial level; of several (random initial poses), the
@@ -193,7 +192,9 @@ def _compared(
     return pd.DataFrame(columns), changes, drawn.units.text
 
 
-def _change(old: Float[Array, " p"], new: Float[Array, " p"], delta: Float[Array, " p"], drawn: Resampling) -> Change:
+def _change(
+    old: Float[np.ndarray, " p"], new: Float[np.ndarray, " p"], delta: Float[np.ndarray, " p"], drawn: Resampling
+) -> Change:
     both = ~np.isnan(delta)
     if not both.any():
         nothing = float("nan")
@@ -217,7 +218,7 @@ def _change(old: Float[Array, " p"], new: Float[Array, " p"], delta: Float[Array
     )
 
 
-def _causes(side: Side, sides: Sides, limit_diameters: float) -> Array:
+def _causes(side: Side, sides: Sides, limit_diameters: float) -> np.ndarray:
     assert side.scored is not None and sides.evaluator is not None
     infos = sides.evaluator.dataset.models_info
     chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, infos, limit_diameters=limit_diameters)

@@ -11,8 +11,6 @@ from jaxtyping import Float
 from evalkit.scores.definitions import AUC_LIMIT_M
 from evalkit.scores.per_pose import add_s_m, area_under_recall, average_recalls, found_errors, solved
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True)
 class Measure:
@@ -30,7 +28,7 @@ class Measure:
     unit: Literal["", "mm", "px", "deg"]
     better: Literal["higher", "lower"]
     text: str
-    values_of: Callable[[pd.DataFrame, float], Float[Array, " n"]]
+    values_of: Callable[[pd.DataFrame, float], Float[np.ndarray, " n"]]
     is_binary: bool = False
 
     @property
@@ -39,7 +37,7 @@ class Measure:
         return 2 if self.unit else 4
 
 
-def _fraction(text: str, values_of: Callable[[pd.DataFrame, float], Array]) -> Measure:
+def _fraction(text: str, values_of: Callable[[pd.DataFrame, float], np.ndarray]) -> Measure:
     return Measure(unit="", better="higher", text=text, values_of=values_of)
 
 

@@ -13,7 +13,6 @@ from evalkit.inputs.pairing import pair_up
 from evalkit.inputs.result_files import ResultFile
 from evalkit.scores import bop24_precision, with_bop19
 
-Array = np.ndarray
 NO_POSE = np.full((4, 4), np.nan)
 CaseKey = tuple[int, int, int, float, float, int]
 """Scene, image, ground-truth index, initial angle and translation (-1 for none), and the number among equal keys."""
@@ -34,8 +33,8 @@ class Scored:
 
     file: ResultFile
     table: pd.DataFrame
-    T_est: Float[Array, "n 4 4"]
-    T_gt: Float[Array, "n 4 4"]
+    T_est: Float[np.ndarray, "n 4 4"]
+    T_gt: Float[np.ndarray, "n 4 4"]
     ignored: int
     precision: dict[str, Any] = field(default_factory=dict)
 
@@ -77,5 +76,5 @@ def score_file(
     )
 
 
-def _stacked(poses: Sequence[Array]) -> Float[Array, "n 4 4"]:
+def _stacked(poses: Sequence[np.ndarray]) -> Float[np.ndarray, "n 4 4"]:
     return np.array(poses, np.float64).reshape(-1, 4, 4)

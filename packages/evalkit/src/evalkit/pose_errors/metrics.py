@@ -13,11 +13,10 @@ from jaxtyping import Bool, Float
 from evalkit.pose_errors import kernels
 from evalkit.pose_errors.nearest_points import NearestPoints
 
-Array = np.ndarray
-Poses = Float[Array, "*b 4 4"]
-Errors = Float[Array, "*b"]
-Points = Float[Array, "n 3"]
-Symmetries = Float[Array, "*g s 4 4"]
+Poses = Float[np.ndarray, "*b 4 4"]
+Errors = Float[np.ndarray, "*b"]
+Points = Float[np.ndarray, "n 3"]
+Symmetries = Float[np.ndarray, "*g s 4 4"]
 VSD_TAUS = np.arange(0.05, 0.51, 0.05)
 """Tolerances of BOP19's VSD, diameters."""
 VSD_COLUMNS = tuple(f"vsd_{tau:.2f}" for tau in VSD_TAUS)
@@ -49,18 +48,18 @@ def mssd(T_est: Poses, T_gt: Poses, points_m: Points, symmetries: Symmetries) ->
     return _per_pose(kernels.max_distance(_flat(T_est), _flat(T_gt), _packed(points_m), transforms), T_est)
 
 
-def mspd(T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points, symmetries: Symmetries) -> Errors:
+def mspd(T_est: Poses, T_gt: Poses, K: Float[np.ndarray, "*k 3 3"], points_m: Points, symmetries: Symmetries) -> Errors:
     """Maximum distance between projected points, at the best symmetry (MSPD), pixels."""
     return projection_errors(T_est, T_gt, K, points_m, symmetries)[0]
 
 
-def proj(T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points) -> Errors:
+def proj(T_est: Poses, T_gt: Poses, K: Float[np.ndarray, "*k 3 3"], points_m: Points) -> Errors:
     """Average distance between projected points, without symmetries, pixels."""
     return projection_errors(T_est, T_gt, K, points_m, np.eye(4)[None])[1]
 
 
 def projection_errors(
-    T_est: Poses, T_gt: Poses, K: Float[Array, "*k 3 3"], points_m: Points, symmetries: Symmetries
+    T_est: Poses, T_gt: Poses, K: Float[np.ndarray, "*k 3 3"], points_m: Points, symmetries: Symmetries
 ) -> tuple[Errors, Errors, Errors]:
     """MSPD, `proj`, and `proj` at the best symmetry in one pass, pixels.
 
@@ -73,16 +72,16 @@ def projection_errors(
     return largest, average, average_best
 
 
-def _packed(values: Float[Array, "*s"]) -> Float[Array, "*s"]:
+def _packed(values: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
     """Contiguous float64, as the compiled loops take it."""
     return np.ascontiguousarray(values, np.float64)
 
 
-def _flat(matrices: Float[Array, "*b r c"]) -> Float[Array, "f r c"]:
+def _flat(matrices: Float[np.ndarray, "*b r c"]) -> Float[np.ndarray, "f r c"]:
     return _packed(matrices).reshape(-1, *matrices.shape[-2:])
 
 
-def _per_pose(errors: Float[Array, " f"], T_est: Poses) -> Errors:
+def _per_pose(errors: Float[np.ndarray, " f"], T_est: Poses) -> Errors:
     return np.asarray(errors).reshape(T_est.shape[:-2])
 
 
@@ -91,7 +90,7 @@ def re(T_est: Poses, T_gt: Poses) -> Errors:
     return _angle_rad(T_est[..., :3, :3], T_gt[..., :3, :3])
 
 
-def _angle_rad(R_est: Float[Array, "*a 3 3"], R_gt: Float[Array, "*b 3 3"]) -> Float[Array, "*c"]:
+def _angle_rad(R_est: Float[np.ndarray, "*a 3 3"], R_gt: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*c"]:
     """Angle of R_est R_gt^-1, exactly 0 where both are equal: only the difference from the identity is computed."""
     D = (R_est - R_gt) @ _inverse(R_gt)
     skew = np.stack([D[..., 2, 1] - D[..., 1, 2], D[..., 0, 2] - D[..., 2, 0], D[..., 1, 0] - D[..., 0, 1]], -1)
@@ -99,7 +98,7 @@ def _angle_rad(R_est: Float[Array, "*a 3 3"], R_gt: Float[Array, "*b 3 3"]) -> F
     return np.asarray(np.arctan2(np.linalg.norm(skew, axis=-1) / 2.0, cosine))
 
 
-def _inverse(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+def _inverse(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 3"]:
     """The exact inverse, by cross products of rows: annotations are not exactly orthonormal, so no transpose."""
     columns = [np.cross(R[..., (i + 1) % 3, :], R[..., (i + 2) % 3, :]) for i in range(3)]
     determinant = np.sum(R[..., 0, :] * columns[0], axis=-1)
@@ -117,7 +116,7 @@ def te(T_est: Poses, T_gt: Poses) -> Errors:
     return np.asarray(np.linalg.norm(te_axes(T_est, T_gt), axis=-1))
 
 
-def te_axes(T_est: Poses, T_gt: Poses) -> Float[Array, "*b 3"]:
+def te_axes(T_est: Poses, T_gt: Poses) -> Float[np.ndarray, "*b 3"]:
     """Estimated minus ground-truth origin along the camera's x (right), y (down) and z (forward), metres, signed."""
     return np.asarray(T_est[..., :3, 3] - T_gt[..., :3, 3])
 
@@ -128,7 +127,7 @@ def viewpoint_deg(T_cam_obj: Poses) -> tuple[Errors, Errors]:
     return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
 
 
-def vss(mask_est: Bool[Array, "h w"], mask_gt: Bool[Array, "h w"]) -> float:
+def vss(mask_est: Bool[np.ndarray, "h w"], mask_gt: Bool[np.ndarray, "h w"]) -> float:
     """Visual surface similarity: intersection over union of two silhouettes, 0 where both are empty.
 
     On full renders this is 1 - cus of bop_toolkit; on visibility masks it is 1 - VSD with tau = infinity.
@@ -138,11 +137,11 @@ def vss(mask_est: Bool[Array, "h w"], mask_gt: Bool[Array, "h w"]) -> float:
 
 
 def visible_masks(
-    distance_est_m: Float[Array, "*b h w"],
-    distance_gt_m: Float[Array, "*b h w"],
-    distance_scene_m: Float[Array, "*b h w"],
+    distance_est_m: Float[np.ndarray, "*b h w"],
+    distance_gt_m: Float[np.ndarray, "*b h w"],
+    distance_scene_m: Float[np.ndarray, "*b h w"],
     delta_m: float = 0.015,
-) -> tuple[Bool[Array, "*b h w"], Bool[Array, "*b h w"]]:
+) -> tuple[Bool[np.ndarray, "*b h w"], Bool[np.ndarray, "*b h w"]]:
     """Visible parts of an estimated and a ground-truth render in a measured scene (BOP19's rules).
 
     A rendered pixel is visible where depth is unknown, or the scene is not nearer by more than `delta_m`. The estimate
@@ -161,12 +160,12 @@ def visible_masks(
 
 
 def vsd(
-    distance_est_m: Float[Array, "*b h w"],
-    distance_gt_m: Float[Array, "*b h w"],
-    distance_scene_m: Float[Array, "*b h w"],
-    taus_m: Float[Array, " t"],
+    distance_est_m: Float[np.ndarray, "*b h w"],
+    distance_gt_m: Float[np.ndarray, "*b h w"],
+    distance_scene_m: Float[np.ndarray, "*b h w"],
+    taus_m: Float[np.ndarray, " t"],
     delta_m: float = 0.015,
-) -> Float[Array, "*b t"]:
+) -> Float[np.ndarray, "*b t"]:
     """Visible surface discrepancy (VSD), 0 to 1, for every tolerance; 1 where neither pose is visible.
 
     The fraction, among pixels where either render is visible, where only one is visible, or where both are and their
@@ -189,8 +188,8 @@ def vsd(
 
 
 def distance_from_depth(
-    K: Float[Array, "3 3"], depth_m: Float[Array, "h w"], x0_px: int = 0, y0_px: int = 0, ray_px: float = 0.5
-) -> Float[Array, "h w"]:
+    K: Float[np.ndarray, "3 3"], depth_m: Float[np.ndarray, "h w"], x0_px: int = 0, y0_px: int = 0, ray_px: float = 0.5
+) -> Float[np.ndarray, "h w"]:
     """Distance from the camera's centre for a depth image that starts at pixel (x0, y0), metres.
 
     Rays go through pixel centres (+0.5), where renderers sample. bop_toolkit sends them through the pixels' corners,

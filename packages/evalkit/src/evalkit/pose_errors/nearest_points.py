@@ -11,7 +11,6 @@ from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from evalkit.pose_errors import kernels
 
-Array = np.ndarray
 GRAPH_FROM = 32
 """Number of poses from which a Delaunay graph, slow to build and fast to walk, costs less than a tree for each."""
 
@@ -34,14 +33,16 @@ class NearestPoints:
         points_m: Vertices in the object frame, metres.
     """
 
-    def __init__(self, points_m: Float[Array, "n 3"]) -> None:
+    def __init__(self, points_m: Float[np.ndarray, "n 3"]) -> None:
         points = np.asarray(points_m, np.float64)
         self._points_m = points[_curve_order(points)]
         self._different = np.sort(np.unique(self._points_m, axis=0, return_index=True)[1])
-        self._graph: tuple[Int[Array, " p1"], Int[Array, " e"]] | None = None
+        self._graph: tuple[Int[np.ndarray, " p1"], Int[np.ndarray, " e"]] | None = None
         self._poses_seen = 0
 
-    def mean_distance_m(self, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"]) -> Float[Array, " b"]:
+    def mean_distance_m(
+        self, T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"]
+    ) -> Float[np.ndarray, " b"]:
         """Average distance from each point at the ground-truth pose to the nearest point at the estimated one, metres.
 
         Args:
@@ -65,7 +66,7 @@ class NearestPoints:
         return result
 
 
-def _curve_order(points_m: Float[Array, "n 3"]) -> Int[Array, " n"]:
+def _curve_order(points_m: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Order of points along a Morton curve."""
     low = points_m.min(axis=0)
     span = float((points_m.max(axis=0) - low).max()) or 1.0
@@ -77,7 +78,7 @@ def _curve_order(points_m: Float[Array, "n 3"]) -> Int[Array, " n"]:
     return np.argsort(code, kind="stable")
 
 
-def _delaunay_graph(points_m: Float[Array, "p 3"]) -> tuple[Int[Array, " p1"], Int[Array, " e"]] | None:
+def _delaunay_graph(points_m: Float[np.ndarray, "p 3"]) -> tuple[Int[np.ndarray, " p1"], Int[np.ndarray, " e"]] | None:
     """Start of each point's neighbours in a list, and that list; None where all points lie in a plane."""
     try:
         delaunay = Delaunay(points_m)

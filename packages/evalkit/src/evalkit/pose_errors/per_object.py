@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull, QhullError
 from evalkit.pose_errors import metrics
 from evalkit.pose_errors.nearest_points import NearestPoints
 
-Array = np.ndarray
 ERRORS = (
     *("add_m", "adi_m", "mssd_m", "mspd_px", "proj_px", "proj_sym_px"),
     *("re_rad", "re_sym_rad", "te_m", "dx_m", "dy_m", "dz_m"),
@@ -27,8 +26,8 @@ class Model:
     mesh: Mesh
     info: ModelInfo
     nearest: NearestPoints = field(init=False)
-    hull_m: Float[Array, "h 3"] = field(init=False)
-    symmetries: Float[Array, "s 4 4"] = field(init=False)
+    hull_m: Float[np.ndarray, "h 3"] = field(init=False)
+    symmetries: Float[np.ndarray, "s 4 4"] = field(init=False)
 
     def __post_init__(self) -> None:
         points_m = np.asarray(self.mesh.vertices_m, np.float64)
@@ -37,8 +36,8 @@ class Model:
         object.__setattr__(self, "symmetries", symmetry_transforms(self.info))
 
     def symmetries_of(
-        self, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"]
-    ) -> Float[Array, "s 4 4"] | Float[Array, "b 2 4 4"]:
+        self, T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"]
+    ) -> Float[np.ndarray, "s 4 4"] | Float[np.ndarray, "b 2 4 4"]:
         """The object's symmetries; a ball's are the identity and each pair's exactly aligning rotation."""
         continuous = self.info.symmetries_continuous
         if not is_ball(continuous):
@@ -48,8 +47,8 @@ class Model:
 
 
 def pose_errors(
-    model: Model, T_est: Float[Array, "b 4 4"], T_gt: Float[Array, "b 4 4"], K: Float[Array, "b 3 3"]
-) -> dict[str, Float[Array, " b"]]:
+    model: Model, T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"], K: Float[np.ndarray, "b 3 3"]
+) -> dict[str, Float[np.ndarray, " b"]]:
     """Every error in `ERRORS` for each pair of poses.
 
     Args:
@@ -74,7 +73,7 @@ def pose_errors(
     return dict(zip(ERRORS, values, strict=True))
 
 
-def hull(points_m: Float[Array, "n 3"]) -> Float[Array, "h 3"]:
+def hull(points_m: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "h 3"]:
     """Vertices of the convex hull; all points where they are few or lie in a plane."""
     try:
         return np.asarray(points_m[ConvexHull(points_m).vertices])

@@ -20,14 +20,13 @@ from evalkit.pose_errors.metrics import VSD_COLUMNS, VSD_TAUS
 from evalkit.pose_errors.per_object import ERRORS, Model, pose_errors
 from evalkit.pose_errors.silhouettes import Patch
 
-Array = np.ndarray
 KEPT_BYTES = 256_000_000
 """Memory for renders of ground-truth poses, kept for the next result file."""
 
 KEPT_IMAGES = 5_000
 """Number of images whose cameras and ground-truth poses are kept."""
 
-Columns = dict[str, Float[Array, " n"]]
+Columns = dict[str, Float[np.ndarray, " n"]]
 
 
 class Scorer:
@@ -61,7 +60,7 @@ class Scorer:
         azimuth_deg, elevation_deg = metrics.viewpoint_deg(T_gt)
         vss, vsd = self._silhouettes(pairs)
         nan = np.nan
-        columns: dict[str, Sequence[Any] | Array] = {
+        columns: dict[str, Sequence[Any] | np.ndarray] = {
             "scene_id": [pair.scene_id for pair in pairs],
             "im_id": [pair.im_id for pair in pairs],
             "obj_id": [gt.obj_id for gt in instances],
@@ -113,7 +112,7 @@ class Scorer:
                 columns[name][indices] = values
         return columns
 
-    def _other_mssd_m(self, pairs: Sequence[MatchedPose]) -> Float[Array, " n"]:
+    def _other_mssd_m(self, pairs: Sequence[MatchedPose]) -> Float[np.ndarray, " n"]:
         """Smallest MSSD of each estimate to another instance of its object in the image, NaN without one."""
         result = np.full(len(pairs), np.inf)
         for obj_id, indices in _by_object(pairs):
@@ -131,7 +130,7 @@ class Scorer:
                 np.minimum.at(result, rows, errors_m)
         return np.where(np.isfinite(result), result, np.nan)
 
-    def _silhouettes(self, pairs: Sequence[MatchedPose]) -> tuple[Float[Array, " n"], Float[Array, "n t"]]:
+    def _silhouettes(self, pairs: Sequence[MatchedPose]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n t"]]:
         """VSS of each pair, 0 where missing, and VSD for every tolerance, NaN where missing or without depth."""
         vss, vsd = np.zeros(len(pairs)), np.full((len(pairs), len(VSD_TAUS)), np.nan)
         self._render_ground_truth(pairs)
@@ -163,7 +162,7 @@ class Scorer:
         while size > KEPT_BYTES:
             size -= self._gt_patches.popitem(last=False)[1].depth_m.nbytes
 
-    def _render(self, obj_id: int, pairs: Sequence[MatchedPose], T_cam_obj: Float[Array, "b 4 4"]) -> list[Patch]:
+    def _render(self, obj_id: int, pairs: Sequence[MatchedPose], T_cam_obj: Float[np.ndarray, "b 4 4"]) -> list[Patch]:
         hull_m = self.model(obj_id).hull_m
         cameras = [self.camera(pair.scene_id, pair.im_id) for pair in pairs]
         return [
@@ -171,7 +170,7 @@ class Scorer:
             for camera, pose in zip(cameras, T_cam_obj, strict=True)
         ]
 
-    def _compare(self, pair: MatchedPose, patch: Patch) -> tuple[float, Float[Array, " t"]]:
+    def _compare(self, pair: MatchedPose, patch: Patch) -> tuple[float, Float[np.ndarray, " t"]]:
         gt_patch, K = self._gt_patches[_gt_key(pair)], self.camera(pair.scene_id, pair.im_id).K
         depth_m = self._depth_m(pair.scene_id, pair.im_id) if self._visible or self._with_vsd else None
         if self._visible and depth_m is None:
@@ -188,7 +187,7 @@ class Scorer:
         return silhouettes.vss_full(patch, gt_patch), vsd
 
 
-def _estimated(pairs: Sequence[MatchedPose]) -> Float[Array, "b 4 4"]:
+def _estimated(pairs: Sequence[MatchedPose]) -> Float[np.ndarray, "b 4 4"]:
     return np.stack([pair.estimate.T_cam_obj for pair in pairs if pair.estimate is not None])
 
 

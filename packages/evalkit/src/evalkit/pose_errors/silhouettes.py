@@ -10,7 +10,6 @@ from posecore.window import silhouette_box
 
 from evalkit.pose_errors import metrics
 
-Array = np.ndarray
 TILE_SIDES_PX = (64, 128, 192, 256, 384, 512, 1024)
 """Tile sides: the renderer keeps buffers of a few sizes."""
 
@@ -25,13 +24,17 @@ class Patch:
         y0_px: row of the patch's first pixel.
     """
 
-    depth_m: Float[Array, "h w"]
+    depth_m: Float[np.ndarray, "h w"]
     x0_px: int
     y0_px: int
 
 
 def render_patch(
-    rasteriser: Rasteriser, obj_id: int, outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]
+    rasteriser: Rasteriser,
+    obj_id: int,
+    outline_m: Float[np.ndarray, "n 3"],
+    camera: Camera,
+    T_cam_obj: Float[np.ndarray, "4 4"],
 ) -> Patch:
     """Render one pose, cropped to the image.
 
@@ -54,7 +57,9 @@ def render_patch(
     return _trim(depth_m, x0_px, y0_px, camera)
 
 
-def _tile(outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array, "4 4"]) -> tuple[int, int, int]:
+def _tile(
+    outline_m: Float[np.ndarray, "n 3"], camera: Camera, T_cam_obj: Float[np.ndarray, "4 4"]
+) -> tuple[int, int, int]:
     """Left, top and side of a square over the object's part of the image; side 0 for an object outside."""
     width, height = camera.width_px, camera.height_px
     left, top, right, bottom = silhouette_box(outline_m, camera.K, T_cam_obj)
@@ -67,7 +72,7 @@ def _tile(outline_m: Float[Array, "n 3"], camera: Camera, T_cam_obj: Float[Array
     return x0, y0, next((side for side in TILE_SIDES_PX if side >= need), need)
 
 
-def _trim(depth_m: Float[Array, "s s"], x0_px: int, y0_px: int, camera: Camera) -> Patch:
+def _trim(depth_m: Float[np.ndarray, "s s"], x0_px: int, y0_px: int, camera: Camera) -> Patch:
     inside = depth_m[: max(camera.height_px - y0_px, 0), : max(camera.width_px - x0_px, 0)]
     rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
     if not len(rows):
@@ -83,7 +88,11 @@ def vss_full(estimated: Patch, gt: Patch) -> float:
 
 
 def vss_visible(
-    estimated: Patch, gt: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"], delta_m: float = 0.015
+    estimated: Patch,
+    gt: Patch,
+    K: Float[np.ndarray, "3 3"],
+    depth_scene_m: Float[np.ndarray, "h w"],
+    delta_m: float = 0.015,
 ) -> float:
     """VSS of the visible parts, by measured depth: 1 - VSD with tau = infinity."""
     distances = _distances(estimated, gt, K, depth_scene_m)
@@ -93,19 +102,19 @@ def vss_visible(
 def vsd(
     estimated: Patch,
     gt: Patch,
-    K: Float[Array, "3 3"],
-    depth_scene_m: Float[Array, "h w"],
-    taus_m: Float[Array, " t"],
+    K: Float[np.ndarray, "3 3"],
+    depth_scene_m: Float[np.ndarray, "h w"],
+    taus_m: Float[np.ndarray, " t"],
     delta_m: float = 0.015,
-) -> Float[Array, " t"]:
+) -> Float[np.ndarray, " t"]:
     """VSD for every tolerance from one pair of renders, see `metrics.vsd`."""
     distances = _distances(estimated, gt, K, depth_scene_m)
     return metrics.vsd(distances[0], distances[1], distances[2], taus_m, delta_m)
 
 
 def _distances(
-    estimated: Patch, gt: Patch, K: Float[Array, "3 3"], depth_scene_m: Float[Array, "h w"]
-) -> list[Float[Array, "rows columns"]]:
+    estimated: Patch, gt: Patch, K: Float[np.ndarray, "3 3"], depth_scene_m: Float[np.ndarray, "h w"]
+) -> list[Float[np.ndarray, "rows columns"]]:
     """Distances of estimate, ground truth and scene where either was rendered, along bop_toolkit's rays."""
     first, second, x0, y0 = _on_common_canvas(estimated, gt)
     rows, columns = first.shape
@@ -113,7 +122,9 @@ def _distances(
     return [metrics.distance_from_depth(K, part, x0, y0, metrics.BOP_RAY_PX) for part in (first, second, scene)]
 
 
-def _on_common_canvas(first: Patch, second: Patch) -> tuple[Float[Array, "h w"], Float[Array, "h w"], int, int]:
+def _on_common_canvas(
+    first: Patch, second: Patch
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"], int, int]:
     filled = [patch for patch in (first, second) if patch.depth_m.size]
     if not filled:
         return np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), 0, 0

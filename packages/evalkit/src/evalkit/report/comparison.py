@@ -12,7 +12,6 @@ from evalkit.scores import found_errors
 from evalkit.scores.bootstrap import Interval, Resampling, resample, units_of
 from evalkit.scores.per_pose import solved
 
-Array = np.ndarray
 Change = dict[str, Any]
 COMPARED: Mapping[str, str] = {
     "re_sym_deg": "rotation error",
@@ -74,11 +73,11 @@ def compare(reference: Scored, other: Scored, *, resamples: int = 1000, seed: in
     return compared
 
 
-def _fractions(flags: Bool[Array, " n"]) -> Float[Array, " n"]:
+def _fractions(flags: Bool[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     return flags.astype(np.float64)
 
 
-def _medians(old: Float[Array, " n"], new: Float[Array, " n"], drawn: Resampling) -> Change:
+def _medians(old: Float[np.ndarray, " n"], new: Float[np.ndarray, " n"], drawn: Resampling) -> Change:
     """Medians over poses with an initial error of this kind, which initial poses that are only translated have not."""
     off = old > NO_ERROR
     if not off.any():
@@ -93,7 +92,7 @@ def _medians(old: Float[Array, " n"], new: Float[Array, " n"], drawn: Resampling
     return counts | {"difference": after - before, "interval": interval}
 
 
-def _means(old: Float[Array, " n"], new: Float[Array, " n"], drawn: Resampling) -> Change:
+def _means(old: Float[np.ndarray, " n"], new: Float[np.ndarray, " n"], drawn: Resampling) -> Change:
     if not len(old):
         nothing = float("nan")
         return {"reference": nothing, "refined": nothing, "difference": nothing, "interval": None}

@@ -12,7 +12,6 @@ from posecore.window import Window, cut, silhouette_box
 
 from evalkit.evaluation.evaluator import Evaluator
 
-Array = np.ndarray
 SIDE_PX = 300
 GT_RGB = (0, 224, 110)
 ESTIMATE_RGB = (255, 64, 160)
@@ -24,7 +23,11 @@ LARGEST_OVER_GT = 3.0
 
 
 def common_window(
-    evaluator: Evaluator, obj_id: int, camera: Camera, T_gt: Float[Array, "4 4"], poses: Sequence[Float[Array, "4 4"]]
+    evaluator: Evaluator,
+    obj_id: int,
+    camera: Camera,
+    T_gt: Float[np.ndarray, "4 4"],
+    poses: Sequence[Float[np.ndarray, "4 4"]],
 ) -> Window:
     """A square around the ground truth and, as far as possible, all estimates."""
     vertices = evaluator.mesh(obj_id).vertices_m
@@ -42,13 +45,13 @@ def common_window(
 
 def overlay(
     evaluator: Evaluator,
-    rgb: UInt8[Array, "h w 3"],
+    rgb: UInt8[np.ndarray, "h w 3"],
     camera: Camera,
     window: Window,
     obj_id: int,
-    T_gt: Float[Array, "4 4"],
-    T_est: Float[Array, "4 4"] | None,
-) -> UInt8[Array, "s s 3"]:
+    T_gt: Float[np.ndarray, "4 4"],
+    T_est: Float[np.ndarray, "4 4"] | None,
+) -> UInt8[np.ndarray, "s s 3"]:
     """The image in a window, with the ground-truth contour in green and the estimated one above, dashed and pink."""
     shrinks = window.side_px > SIDE_PX
     patch = np.ascontiguousarray(cut(rgb, window, SIDE_PX, interpolation="area" if shrinks else "linear", fill=235))
@@ -62,11 +65,11 @@ def overlay(
     return patch
 
 
-def _outlines(mask: Bool[Array, "s s"]) -> Sequence[Array]:
+def _outlines(mask: Bool[np.ndarray, "s s"]) -> Sequence[np.ndarray]:
     return cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)[0]
 
 
-def _dashes(outline: Array) -> list[Array]:
+def _dashes(outline: np.ndarray) -> list[np.ndarray]:
     """Pieces of a closed outline of adjacent pixels, as many as fit with equal gaps."""
     count = max(1, round(len(outline) / (DASH_PX + GAP_PX)))
     starts = np.linspace(0, len(outline), count, endpoint=False).astype(int)
@@ -74,12 +77,14 @@ def _dashes(outline: Array) -> list[Array]:
     return [outline[start : start + length] for start in starts]
 
 
-def _draw(patch: UInt8[Array, "s s 3"], lines: Sequence[Array], closed: bool, colour: tuple[int, int, int]) -> None:
+def _draw(
+    patch: UInt8[np.ndarray, "s s 3"], lines: Sequence[np.ndarray], closed: bool, colour: tuple[int, int, int]
+) -> None:
     cv2.polylines(patch, lines, closed, (20, 20, 20), 4, cv2.LINE_AA)
     cv2.polylines(patch, lines, closed, colour, 2, cv2.LINE_AA)
 
 
-def read_image(evaluator: Evaluator, scene_id: int, im_id: int) -> UInt8[Array, "h w 3"] | None:
+def read_image(evaluator: Evaluator, scene_id: int, im_id: int) -> UInt8[np.ndarray, "h w 3"] | None:
     """The image, or None where the dataset comes without it."""
     try:
         return evaluator.dataset.rgb(scene_id, im_id)
@@ -87,7 +92,7 @@ def read_image(evaluator: Evaluator, scene_id: int, im_id: int) -> UInt8[Array, 
         return None
 
 
-def data_url(image: UInt8[Array, "h w 3"], quality: int = 82) -> str:
+def data_url(image: UInt8[np.ndarray, "h w 3"], quality: int = 82) -> str:
     """The image as a JPEG inside a URL."""
     ok, data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not ok:

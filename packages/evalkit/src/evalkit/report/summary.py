@@ -20,7 +20,6 @@ from evalkit.scores.bootstrap import score_intervals
 from evalkit.scores.convergence import by_level
 from evalkit.scores.failure_causes import cause_counts, causes
 
-Array = np.ndarray
 VSS_DEFINITIONS = {
     "full": "full: whole silhouettes rendered at both poses, occluders ignored (1 - cus of bop_toolkit)",
     "visible": "visible: visible parts of both silhouettes by measured depth, tolerance 15 mm (1 - VSD, tau infinite)",

@@ -7,7 +7,6 @@ from html import escape
 import numpy as np
 from jaxtyping import Float
 
-Array = np.ndarray
 ToDrawing = Callable[[float, float], tuple[float, float]]
 """From data coordinates to the drawing's."""
 WIDTH, HEIGHT = 460, 290
@@ -52,10 +51,10 @@ class Series:
 
     name: str
     style: LineStyle
-    x: Float[Array, " n"]
-    y: Float[Array, " n"]
-    low: Float[Array, " n"] | None = None
-    high: Float[Array, " n"] | None = None
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    low: Float[np.ndarray, " n"] | None = None
+    high: Float[np.ndarray, " n"] | None = None
     is_measured: bool = False
 
 
@@ -72,7 +71,7 @@ def line_styles(are_initial: Sequence[bool]) -> list[LineStyle]:
     return styles
 
 
-def cumulative(values: Float[Array, " n"], limit: float, steps: int = 121) -> tuple[Array, Array]:
+def cumulative(values: Float[np.ndarray, " n"], limit: float, steps: int = 121) -> tuple[np.ndarray, np.ndarray]:
     """Fraction of values at or under each of `steps` thresholds from 0 to `limit`; NaN is never under."""
     thresholds = np.linspace(0.0, limit, steps)
     ordered = np.sort(values[np.isfinite(values)])

@@ -19,7 +19,6 @@ from evalkit.scores.bootstrap import RESAMPLES, Resampling, resample, units_of
 from evalkit.scores.per_pose import Values, score_values
 from evalkit.scores.totals import statistic_of
 
-Array = np.ndarray
 SCORES = ("vss_mean", "add_s_recall_0.1d", "re_sym_deg_median", "tz_mm_median", "add_mm_median")
 VISIBILITY_EDGES = tuple(step / 10 for step in range(11))
 AZIMUTH_EDGES_DEG = tuple(float(edge) for edge in range(-180, 181, 45))
@@ -78,12 +77,12 @@ def binned(
     return pd.DataFrame(rows, columns=names)
 
 
-def _between(values: Float[Array, " n"], low: float, high: float, *, last: bool) -> Bool[Array, " n"]:
+def _between(values: Float[np.ndarray, " n"], low: float, high: float, *, last: bool) -> Bool[np.ndarray, " n"]:
     return np.asarray((values >= low) & ((values <= high) if last else (values < high)))
 
 
 def _summed_up(
-    name: str, values: Values, inside: Bool[Array, " n"], resampling: Resampling | None
+    name: str, values: Values, inside: Bool[np.ndarray, " n"], resampling: Resampling | None
 ) -> dict[str, float | int | str]:
     part = Values(per_row=np.where(inside, values.per_row, np.nan), statistic=values.statistic)
     interval = None if resampling is None else resampling.interval(part)
@@ -126,7 +125,7 @@ def by_viewpoint(
     return binned(table, {"view_azimuth_deg": azimuth_edges_deg, "view_elevation_deg": elevation_edges_deg}, **options)
 
 
-def round_edges(values: Float[Array, " n"], bins: int = DISTANCE_BINS) -> tuple[float, ...]:
+def round_edges(values: Float[np.ndarray, " n"], bins: int = DISTANCE_BINS) -> tuple[float, ...]:
     """Edges at multiples of 1, 2, 2.5 or 5 times a power of ten that hold all finite values in at most `bins` bins."""
     finite = values[np.isfinite(values)]
     if not len(finite):

@@ -22,7 +22,6 @@ from scipy import special
 
 from evalkit.scores.per_pose import Values, score_values
 
-Array = np.ndarray
 Interval = tuple[float, float] | None
 """Lower and upper end, or None where there are fewer than two units."""
 CONFIDENCE = 0.95
@@ -46,7 +45,7 @@ class Units:
 
     kind: Literal["scene", "image"]
     text: str
-    of_row: Int[Array, " n"]
+    of_row: Int[np.ndarray, " n"]
     count: int
 
 
@@ -82,7 +81,7 @@ def units_of(table: pd.DataFrame, block_images: int | None = None) -> Units:
     )
 
 
-def _joined(kind: Literal["scene", "image"], of_row: Int[Array, " n"], count: int) -> Units:
+def _joined(kind: Literal["scene", "image"], of_row: Int[np.ndarray, " n"], count: int) -> Units:
     size = -(-count // MAX_UNITS) if count else 1
     joined = -(-count // size)
     return Units(kind=kind, text=_text(kind, joined, size), of_row=(of_row // size).astype(np.int64), count=joined)
@@ -104,9 +103,9 @@ class Resampling:
     """
 
     units: Units
-    weights: Float[Array, "r u"]
+    weights: Float[np.ndarray, "r u"]
 
-    def means(self, columns: Float[Array, "m n"]) -> Float[Array, "m r"]:
+    def means(self, columns: Float[np.ndarray, "m n"]) -> Float[np.ndarray, "m r"]:
         """Mean of each column over the rows of each resample; NaN values are left out, NaN without any other."""
         is_valid = ~np.isnan(columns)
         sums = np.stack([self._per_unit(column) for column in np.where(is_valid, columns, 0.0)])
@@ -114,7 +113,7 @@ class Resampling:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((sums @ self.weights.T) / (counts @ self.weights.T))
 
-    def medians(self, values: Float[Array, " n"]) -> Float[Array, " r"]:
+    def medians(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " r"]:
         """Median of the rows of each resample, exactly; NaN values are left out, NaN without any other."""
         is_valid = np.flatnonzero(~np.isnan(values))
         order = is_valid[np.argsort(values[is_valid], kind="stable")]
@@ -135,7 +134,7 @@ class Resampling:
     def intervals(self, values: Mapping[str, Values]) -> dict[str, Interval]:
         """Interval of each score."""
         means = [name for name, item in values.items() if item.statistic == "mean"]
-        sampled: dict[str, Array] = {}
+        sampled: dict[str, np.ndarray] = {}
         if means:
             columns = np.stack([values[name].per_row for name in means])
             sampled |= dict(zip(means, self.means(columns), strict=True))
@@ -144,11 +143,11 @@ class Resampling:
                 sampled[name] = self.medians(item.per_row)
         return {name: self.ends(sampled[name], self.units_with(item.per_row)) for name, item in values.items()}
 
-    def units_with(self, values: Float[Array, " n"]) -> int:
+    def units_with(self, values: Float[np.ndarray, " n"]) -> int:
         """Number of units with a value that is not NaN."""
         return len(np.unique(self.units.of_row[~np.isnan(values)]))
 
-    def ends(self, sampled: Float[Array, " r"], units: int) -> Interval:
+    def ends(self, sampled: Float[np.ndarray, " r"], units: int) -> Interval:
         """Interval from resampled scores of so many units."""
         kept = sampled[~np.isnan(sampled)]
         if units < 2 or not len(kept) or not np.isfinite(kept).all():
@@ -156,7 +155,7 @@ class Resampling:
         low, high = np.quantile(kept, outer_percentiles(units))
         return float(low), float(high)
 
-    def _per_unit(self, values: Float[Array, " n"]) -> Float[Array, " u"]:
+    def _per_unit(self, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " u"]:
         sums = np.bincount(self.units.of_row, values, minlength=self.units.count)
         return sums.astype(np.float64)  # without rows numpy returns integers
 
@@ -187,10 +186,14 @@ def outer_percentiles(units: int, confidence: float = CONFIDENCE) -> tuple[float
     return low, 1.0 - low
 
 
-def _search(unit: Int[Array, " n"], weights: Float[Array, "r u"], rank: Float[Array, " r"]) -> Int[Array, " r"]:
+def _search(
+    unit: Int[np.ndarray, " n"], weights: Float[np.ndarray, "r u"], rank: Float[np.ndarray, " r"]
+) -> Int[np.ndarray, " r"]:
     """For each resample the first index at which the cumulative weight exceeds `rank`; `unit` is in order of value."""
     result = np.zeros(len(weights), np.int64)
-    open_ranges: list[tuple[int, int, Array, Array]] = [(0, len(unit), np.arange(len(weights)), np.zeros(len(weights)))]
+    open_ranges: list[tuple[int, int, np.ndarray, np.ndarray]] = [
+        (0, len(unit), np.arange(len(weights)), np.zeros(len(weights)))
+    ]
     while open_ranges:
         start, stop, rows, before = open_ranges.pop()
         edges = np.linspace(start, stop, FAN + 1).astype(np.int64)

@@ -30,7 +30,6 @@ from evalkit.scores.definitions import (
 )
 from evalkit.scores.per_pose import in_diameters
 
-Array = np.ndarray
 IMAGE = ["scene_id", "im_id"]
 TARGET = ["scene_id", "im_id", "obj_id"]
 
@@ -55,13 +54,13 @@ class AllErrors:
 
 
 def greedy_matches(
-    estimate: Int[Array, " c"],
-    instance: Int[Array, " c"],
-    error: Float[Array, " c"],
-    rank: Int[Array, " e"],
+    estimate: Int[np.ndarray, " c"],
+    instance: Int[np.ndarray, " c"],
+    error: Float[np.ndarray, " c"],
+    rank: Int[np.ndarray, " e"],
     instances: int,
-    limits: Float[Array, " t"],
-) -> Int[Array, "t e"]:
+    limits: Float[np.ndarray, " t"],
+) -> Int[np.ndarray, "t e"]:
     """Match estimates to instances for every threshold at once.
 
     Args:
@@ -100,7 +99,7 @@ def greedy_matches(
     return matched
 
 
-def ranks(estimates: pd.DataFrame, among: list[str]) -> Int[Array, " e"]:
+def ranks(estimates: pd.DataFrame, among: list[str]) -> Int[np.ndarray, " e"]:
     """Rank of each estimate by falling score among those with the same ids; equal scores keep the table's order."""
     order = np.argsort(-column(estimates, "score"), kind="stable")
     positions = estimates.iloc[order].groupby(among, sort=False).cumcount().to_numpy()
@@ -109,7 +108,7 @@ def ranks(estimates: pd.DataFrame, among: list[str]) -> Int[Array, " e"]:
     return result
 
 
-def target_instances(instances: pd.DataFrame) -> Bool[Array, " g"]:
+def target_instances(instances: pd.DataFrame) -> Bool[np.ndarray, " g"]:
     """Whether an instance is part of its localization target: the `inst_count` most visible, ties in image order."""
     visible = np.nan_to_num(column(instances, "visib_fract"), nan=1.0)
     order = np.lexsort((instances.gt_index.to_numpy(), -visible))
@@ -134,7 +133,7 @@ def bop19_recalls(all_errors: AllErrors) -> pd.DataFrame:
     kept = is_target[instance] & (rank[estimate] < instances.inst_count.to_numpy()[instance])
     estimate, instance, errors = estimate[kept], instance[kept], errors[kept]
 
-    def recall(error: Float[Array, " c"], limits: Float[Array, " t"]) -> Float[Array, " g"]:
+    def recall(error: Float[np.ndarray, " c"], limits: Float[np.ndarray, " t"]) -> Float[np.ndarray, " g"]:
         matched = greedy_matches(estimate, instance, error, rank, len(instances), limits)
         hits = np.bincount(matched[matched >= 0], minlength=len(instances))
         return np.asarray(hits / len(limits))
@@ -227,8 +226,11 @@ def _with_means(by_object: dict[int, dict[str, float]]) -> dict[str, Any]:
 
 
 def _precision_of(
-    estimates: pd.DataFrame, instances: pd.DataFrame, is_counted: Bool[Array, " e"], is_visible: Bool[Array, " g"]
-) -> Callable[[int, Int[Array, "t e"]], float]:
+    estimates: pd.DataFrame,
+    instances: pd.DataFrame,
+    is_counted: Bool[np.ndarray, " e"],
+    is_visible: Bool[np.ndarray, " g"],
+) -> Callable[[int, Int[np.ndarray, "t e"]], float]:
     """A function of an object and its matches at every threshold: the mean of its average precisions."""
     # bop_toolkit goes through images in the targets' order and keeps it among equal scores.
     order = np.lexsort((ranks(estimates, TARGET), estimates.im_id, estimates.scene_id))
@@ -237,7 +239,7 @@ def _precision_of(
     obj_ids = estimates.obj_id.to_numpy()
     is_visible_or_none = np.append(is_visible, False)  # position -1: no match
 
-    def precision(obj_id: int, matched: Int[Array, "t e"]) -> float:
+    def precision(obj_id: int, matched: Int[np.ndarray, "t e"]) -> float:
         of_object = order[obj_ids[order] == obj_id]
         count = int((is_visible & (instances.obj_id.to_numpy() == obj_id)).sum())
         values = []
@@ -249,7 +251,7 @@ def _precision_of(
     return precision
 
 
-def average_precision(is_true: Bool[Array, " n"], instances: int) -> float:
+def average_precision(is_true: Bool[np.ndarray, " n"], instances: int) -> float:
     """Mean of the best precision at or beyond each of COCO's 101 levels of recall.
 
     Args:
@@ -266,13 +268,13 @@ def average_precision(is_true: Bool[Array, " n"], instances: int) -> float:
 
 
 def _scaled(
-    errors: pd.DataFrame, instances: pd.DataFrame, instance: Int[Array, " c"]
-) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    errors: pd.DataFrame, instances: pd.DataFrame, instance: Int[np.ndarray, " c"]
+) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " c"]]:
     """MSSD in diameters, and MSPD in pixels of an image 640 wide."""
     factor = MSPD_WIDTH_PX / column(instances, "image_width_px")[instance]
     mssd_diameters = in_diameters(column(errors, "mssd_m"), column(instances, "diameter_m")[instance])
     return mssd_diameters, column(errors, "mspd_px") * factor
 
 
-def _positions(errors: pd.DataFrame, name: str) -> Int[Array, " c"]:
+def _positions(errors: pd.DataFrame, name: str) -> Int[np.ndarray, " c"]:
     return np.asarray(errors[name].to_numpy(), dtype=np.int64)

@@ -19,7 +19,6 @@ from evalkit.scores.bootstrap import resample, units_of
 from evalkit.scores.definitions import ROUNDING_M, ROUNDING_RAD
 from evalkit.scores.per_pose import Values, diverged
 
-Array = np.ndarray
 Point = dict[str, Any]
 Curves = dict[str, list[Point]]
 """By kind of perturbation, "angle" and "translation": one point for each level, rising."""

@@ -41,7 +41,6 @@ from evalkit.error_table import column
 from evalkit.scores.definitions import RECALL_DIAMETERS
 from evalkit.scores.per_pose import solved
 
-Array = np.ndarray
 OTHER_DIAMETERS = 0.2
 FLIP_RAD = np.deg2rad(160.0)
 NEAR_FLIP_RAD = np.deg2rad(45.0)
@@ -74,14 +73,14 @@ class Parts:
         out_of_plane_rad: the rest of the rotation, 0 to pi.
     """
 
-    z_m: Float[Array, " n"]
-    xy_m: Float[Array, " n"]
-    angle_rad: Float[Array, " n"]
-    in_plane_rad: Float[Array, " n"]
-    out_of_plane_rad: Float[Array, " n"]
+    z_m: Float[np.ndarray, " n"]
+    xy_m: Float[np.ndarray, " n"]
+    angle_rad: Float[np.ndarray, " n"]
+    in_plane_rad: Float[np.ndarray, " n"]
+    out_of_plane_rad: Float[np.ndarray, " n"]
 
 
-def parts_of(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"]) -> Parts:
+def parts_of(T_est: Float[np.ndarray, "n 4 4"], T_gt: Float[np.ndarray, "n 4 4"]) -> Parts:
     """Decompose errors about the viewing ray of each ground-truth pose."""
     origin = T_gt[:, :3, 3]
     length = np.linalg.norm(origin, axis=1, keepdims=True)
@@ -108,8 +107,8 @@ def parts_of(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"]) -> Parts
 
 def causes(
     table: pd.DataFrame,
-    T_est: Float[Array, "n 4 4"],
-    T_gt: Float[Array, "n 4 4"],
+    T_est: Float[np.ndarray, "n 4 4"],
+    T_gt: Float[np.ndarray, "n 4 4"],
     infos: Mapping[int, Symmetric] | None = None,
     *,
     limit_diameters: float = RECALL_DIAMETERS,
@@ -151,8 +150,8 @@ def causes(
 
 
 def _alone(
-    parts: Parts, diameter_m: Float[Array, " n"], limit_diameters: float
-) -> tuple[Bool[Array, " n"], np.ndarray]:
+    parts: Parts, diameter_m: Float[np.ndarray, " n"], limit_diameters: float
+) -> tuple[Bool[np.ndarray, " n"], np.ndarray]:
     """Whether a pose would pass without one kind of error, and which kind."""
     z, xy = parts.z_m / diameter_m, parts.xy_m / diameter_m
     left = {
@@ -165,7 +164,7 @@ def _alone(
     return np.min(rest, axis=0) < limit_diameters, np.array(list(left), dtype=object)[best]
 
 
-def _displacement(angle_rad: Float[Array, " n"]) -> Float[Array, " n"]:
+def _displacement(angle_rad: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Displacement of model points by a rotation, diameters."""
     return np.asarray(2.0 * ARM_DIAMETERS * np.sin(angle_rad / 2.0))
 

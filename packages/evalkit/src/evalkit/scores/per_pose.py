@@ -24,7 +24,6 @@ from evalkit.scores.definitions import (
     VSD_LIMITS,
 )
 
-Array = np.ndarray
 Statistic = Literal["mean", "median"]
 
 
@@ -37,7 +36,7 @@ class Values:
         statistic: of the values.
     """
 
-    per_row: Float[Array, " n"]
+    per_row: Float[np.ndarray, " n"]
     statistic: Statistic
 
 
@@ -62,7 +61,7 @@ def score_values(table: pd.DataFrame) -> dict[str, Values]:
     return values
 
 
-def _recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
+def _recalls(table: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     diameter = column(table, "diameter_m")
     add, adi, add_s = column(table, "add_m"), column(table, "adi_m"), add_s_m(table)
     re_sym_deg = np.rad2deg(column(table, "re_sym_rad"))
@@ -80,12 +79,14 @@ def _recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     return {name: np.asarray(fraction, np.float64) for name, fraction in fractions.items()} | areas
 
 
-def in_diameters(error_m: Float[Array, " n"], diameter_m: Float[Array, " n"]) -> Float[Array, " n"]:
+def in_diameters(error_m: Float[np.ndarray, " n"], diameter_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Errors in diameters, divided in millimetres as bop_toolkit does: 10 mm of 100 mm are 0.1, of metres not quite."""
     return np.asarray((error_m * 1e3) / (diameter_m * 1e3))
 
 
-def area_under_recall(errors: Float[Array, " n"], limit: float | Float[Array, " n"]) -> Float[Array, " n"]:
+def area_under_recall(
+    errors: Float[np.ndarray, " n"], limit: float | Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """Contribution of each error to the area under the recall curve from 0 to `limit`: their mean is the exact area.
 
     Args:
@@ -95,17 +96,17 @@ def area_under_recall(errors: Float[Array, " n"], limit: float | Float[Array, " 
     return np.nan_to_num(1.0 - errors / limit, nan=0.0).clip(0.0, 1.0)
 
 
-def add_s_m(table: pd.DataFrame) -> Float[Array, " n"]:
+def add_s_m(table: pd.DataFrame) -> Float[np.ndarray, " n"]:
     """ADD(-S): ADI of objects with symmetries, ADD of the others, metres, NaN where missing."""
     return np.where(column(table, "symmetric") > 0, column(table, "adi_m"), column(table, "add_m"))
 
 
-def solved(table: pd.DataFrame, limit_diameters: float = RECALL_DIAMETERS) -> Bool[Array, " n"]:
+def solved(table: pd.DataFrame, limit_diameters: float = RECALL_DIAMETERS) -> Bool[np.ndarray, " n"]:
     """Rows with an ADD(-S) under a fraction of the diameter; missing ones are not."""
     return np.asarray(in_diameters(add_s_m(table), column(table, "diameter_m")) < limit_diameters)
 
 
-def average_recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
+def average_recalls(table: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """BOP19's average recalls: for each row the fraction of thresholds that it is under.
 
     Columns `bop19_mssd`, `bop19_mspd`, `bop19_vsd` (see `bop_matching.bop19_recalls`) are used where present: they hold
@@ -131,17 +132,17 @@ def average_recalls(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     }
 
 
-def _column_or(table: pd.DataFrame, name: str, otherwise: Callable[[], Array]) -> Float[Array, " n"]:
+def _column_or(table: pd.DataFrame, name: str, otherwise: Callable[[], np.ndarray]) -> Float[np.ndarray, " n"]:
     return column(table, name) if name in table else otherwise()
 
 
-def under(errors: Float[Array, " n"], limits: Float[Array, " t"]) -> Float[Array, " n"]:
+def under(errors: Float[np.ndarray, " n"], limits: Float[np.ndarray, " t"]) -> Float[np.ndarray, " n"]:
     """For each error the fraction of limits above; 0 for NaN."""
     below = len(limits) - np.searchsorted(limits, errors, side="right")
     return np.where(np.isfinite(errors), below, 0) / len(limits)
 
 
-def _vsd_recalls(table: pd.DataFrame) -> Float[Array, " n"]:
+def _vsd_recalls(table: pd.DataFrame) -> Float[np.ndarray, " n"]:
     nothing = np.full(len(table), np.nan)
     if not all(name in table for name in VSD_COLUMNS):
         return nothing
@@ -151,7 +152,7 @@ def _vsd_recalls(table: pd.DataFrame) -> Float[Array, " n"]:
     return np.asarray(np.mean([under(row, VSD_LIMITS) for row in errors], axis=0))
 
 
-def found_errors(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
+def found_errors(table: pd.DataFrame) -> dict[str, Float[np.ndarray, " n"]]:
     """Errors by name: degrees, millimetres and pixels, translations per camera axis without sign, NaN where missing."""
     return {
         "re_deg": np.rad2deg(column(table, "re_rad")),
@@ -168,14 +169,14 @@ def found_errors(table: pd.DataFrame) -> dict[str, Float[Array, " n"]]:
     }
 
 
-def diverged(table: pd.DataFrame) -> Bool[Array, " n"]:
+def diverged(table: pd.DataFrame) -> Bool[np.ndarray, " n"]:
     """Rows that are missing, rotated by over 45 degrees or translated by over half a diameter."""
     rotated = column(table, "re_sym_rad") > DIVERGED_RAD + ROUNDING_RAD
     translated = column(table, "te_m") > DIVERGED_DIAMETERS * column(table, "diameter_m") + ROUNDING_M
     return np.asarray(rotated | translated | (column(table, "found") == 0))
 
 
-def _once_an_image(table: pd.DataFrame, values: Float[Array, " n"]) -> Float[Array, " n"]:
+def _once_an_image(table: pd.DataFrame, values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """The first finite value of each image, NaN in its other rows: in BOP all estimates of an image have one time."""
     timed = np.flatnonzero(np.isfinite(values))
     first = ~table.iloc[timed].duplicated(["scene_id", "im_id"]).to_numpy()

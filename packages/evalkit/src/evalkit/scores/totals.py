@@ -8,8 +8,6 @@ import pandas as pd
 from evalkit.error_table import column
 from evalkit.scores.per_pose import Values, score_values
 
-Array = np.ndarray
-
 
 def scores(table: pd.DataFrame) -> dict[str, Any]:
     """Scores of a table: counts, and the mean or median of every entry of `score_values`.

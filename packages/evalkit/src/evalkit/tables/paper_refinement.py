@@ -24,7 +24,6 @@ from evalkit.scores.bootstrap import Resampling, resample, units_of
 from evalkit.scores.per_pose import Values, score_values
 from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 
-Array = np.ndarray
 By = Literal["object", "scene"]
 MeanOver = Literal["groups", "poses"]
 KEY: Mapping[By, str] = {"object": "obj_id", "scene": "scene_id"}
@@ -221,7 +220,7 @@ def _group_ids(methods: Sequence[Method], by: By) -> list[int]:
     return sorted({int(value) for method in methods for value in method.table[KEY[by]].unique()})
 
 
-def _groups(method: Method, by: By, mean_over: MeanOver) -> Int[Array, " n"] | None:
+def _groups(method: Method, by: By, mean_over: MeanOver) -> Int[np.ndarray, " n"] | None:
     """The group of each row, for means over groups; None for means over poses."""
     return column(method.table, KEY[by]).astype(np.int64) if mean_over == "groups" else None
 
@@ -243,7 +242,7 @@ def _by_method(
 
 def _cells(
     table: pd.DataFrame,
-    groups: Int[Array, " n"] | None,
+    groups: Int[np.ndarray, " n"] | None,
     resamples: int,
     seed: int,
     keys: Sequence[str] = tuple(SCORE),
@@ -256,7 +255,7 @@ def _cells(
     return cells | {key: _cell(values[key], groups, resampling) for key in keys}
 
 
-def _cell(values: Values, groups: Int[Array, " n"] | None, resampling: Resampling | None) -> Cell:
+def _cell(values: Values, groups: Int[np.ndarray, " n"] | None, resampling: Resampling | None) -> Cell:
     assert values.statistic == "mean"
     parts = _parts(values.per_row, groups)
     value = _mean(np.array([_mean(part) for part in parts]))
@@ -270,13 +269,13 @@ def _cell(values: Values, groups: Int[Array, " n"] | None, resampling: Resamplin
     return value if ends is None else Interval(value=value, low=ends[0], high=ends[1])
 
 
-def _parts(per_row: Float[Array, " n"], groups: Int[Array, " n"] | None) -> Float[Array, "g n"]:
+def _parts(per_row: Float[np.ndarray, " n"], groups: Int[np.ndarray, " n"] | None) -> Float[np.ndarray, "g n"]:
     """The values of each group, NaN elsewhere; without groups all values as one."""
     if groups is None or not len(groups):
         return per_row[None]
     return np.stack([np.where(groups == group, per_row, np.nan) for group in np.unique(groups)])
 
 
-def _mean(values: Float[Array, " n"]) -> float:
+def _mean(values: Float[np.ndarray, " n"]) -> float:
     kept = values[~np.isnan(values)]
     return float(kept.mean()) if len(kept) else float("nan")

@@ -17,7 +17,6 @@ from posecore.symmetry import Symmetric
 from evalkit.tracking.residuals import residuals
 from evalkit.tracking.scores import LIMIT_M, LIMIT_RAD
 
-Array = np.ndarray
 Frame = TypeVar("Frame", contravariant=True)
 
 
@@ -25,11 +24,11 @@ Frame = TypeVar("Frame", contravariant=True)
 class ResettableTracker(Protocol[Frame]):
     """Interface of a tracker for `run_with_resets`."""
 
-    def initialise(self, frame: Frame, T_cam_obj: Float[Array, "4 4"]) -> None:
+    def initialise(self, frame: Frame, T_cam_obj: Float[np.ndarray, "4 4"]) -> None:
         """Start from the ground-truth pose of this frame."""
         ...
 
-    def track(self, frame: Frame) -> Float[Array, "4 4"] | None:
+    def track(self, frame: Frame) -> Float[np.ndarray, "4 4"] | None:
         """The pose in the next frame, metres; None if the tracker has lost the object."""
         ...
 
@@ -45,10 +44,10 @@ class ResetRun:
         time_s: (n,) time of `track`; NaN in the first frame.
     """
 
-    T_est: Float[Array, "n 4 4"]
-    was_initialised: Bool[Array, " n"]
-    tracked: Bool[Array, " n"]
-    time_s: Float[Array, " n"]
+    T_est: Float[np.ndarray, "n 4 4"]
+    was_initialised: Bool[np.ndarray, " n"]
+    tracked: Bool[np.ndarray, " n"]
+    time_s: Float[np.ndarray, " n"]
 
     @property
     def success(self) -> float:
@@ -64,7 +63,7 @@ class ResetRun:
 def run_with_resets(
     tracker: ResettableTracker[Frame],
     frames: Iterable[Frame],
-    T_gt: Iterable[Float[Array, "4 4"]],
+    T_gt: Iterable[Float[np.ndarray, "4 4"]],
     *,
     info: Symmetric | None = None,
 ) -> ResetRun:
@@ -111,6 +110,6 @@ def run_with_resets(
     )
 
 
-def _is_tracked(T_est: Float[Array, "4 4"], T_gt: Float[Array, "4 4"], info: Symmetric | None) -> bool:
+def _is_tracked(T_est: Float[np.ndarray, "4 4"], T_gt: Float[np.ndarray, "4 4"], info: Symmetric | None) -> bool:
     errors = residuals(np.asarray(T_est, np.float64)[None], np.asarray(T_gt, np.float64)[None], info)
     return bool((errors.distance_m[0] < LIMIT_M) and (errors.angle_rad[0] < LIMIT_RAD))

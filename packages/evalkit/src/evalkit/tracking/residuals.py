@@ -10,7 +10,6 @@ from jaxtyping import Float, Int
 from posecore import se3
 from posecore.symmetry import Symmetric, symmetric_copies
 
-Array = np.ndarray
 TIE_RAD = 1e-6
 """Copies of a symmetric object whose residual angles differ by less are equally near."""
 
@@ -24,21 +23,23 @@ class Residuals:
         dt_m: (n, 3) `t_est - t_gt`.
     """
 
-    R: Float[Array, "n 3 3"]
-    dt_m: Float[Array, "n 3"]
+    R: Float[np.ndarray, "n 3 3"]
+    dt_m: Float[np.ndarray, "n 3"]
 
     @property
-    def angle_rad(self) -> Float[Array, " n"]:
+    def angle_rad(self) -> Float[np.ndarray, " n"]:
         """Rotation error."""
         return se3.rotation_angle_rad(self.R)
 
     @property
-    def distance_m(self) -> Float[Array, " n"]:
+    def distance_m(self) -> Float[np.ndarray, " n"]:
         """Distance of the origins."""
         return np.asarray(np.linalg.norm(self.dt_m, axis=1))
 
 
-def residuals(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None) -> Residuals:
+def residuals(
+    T_est: Float[np.ndarray, "n 4 4"], T_gt: Float[np.ndarray, "n 4 4"], info: Symmetric | None = None
+) -> Residuals:
     """Residuals of a sequence, frames in order.
 
     Args:
@@ -52,7 +53,7 @@ def residuals(T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: S
     return Residuals(R=R[rows, chosen], dt_m=dt_m[rows, chosen])
 
 
-def _nearest_copies(R: Float[Array, "n s 3 3"]) -> Int[Array, " n"]:
+def _nearest_copies(R: Float[np.ndarray, "n s 3 3"]) -> Int[np.ndarray, " n"]:
     """Copy with the smallest angle in each frame; of equal ones the nearest to the residual of the frame before."""
     angle = np.where(np.isnan(R[..., 0, 0]), np.inf, se3.rotation_angle_rad(R))
     chosen = np.asarray(angle.argmin(axis=1))
@@ -67,8 +68,8 @@ def _nearest_copies(R: Float[Array, "n s 3 3"]) -> Int[Array, " n"]:
 
 
 def changes(
-    T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None = None
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    T_est: Float[np.ndarray, "n 4 4"], T_gt: Float[np.ndarray, "n 4 4"], info: Symmetric | None = None
+) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
     """Change of the residual from each frame to the next (m = n - 1), metres and radians; NaN beside a gap.
 
     The later frame's residual is to the symmetry-equivalent ground truth nearest to the earlier frame's residual.
@@ -85,8 +86,11 @@ def changes(
 
 
 def _to_copies(
-    R_near: Float[Array, "n 3 3"], T_est: Float[Array, "n 4 4"], T_gt: Float[Array, "n 4 4"], info: Symmetric | None
-) -> tuple[Float[Array, "n s 3 3"], Float[Array, "n s 3"]]:
+    R_near: Float[np.ndarray, "n 3 3"],
+    T_est: Float[np.ndarray, "n 4 4"],
+    T_gt: Float[np.ndarray, "n 4 4"],
+    info: Symmetric | None,
+) -> tuple[Float[np.ndarray, "n s 3 3"], Float[np.ndarray, "n s 3"]]:
     """Residuals to the symmetry-equivalent ground-truth poses: one for each discrete symmetry.
 
     With an axis of revolution, each is rotated about it to come nearest to `R_near`, exactly: sampled angles would put
@@ -101,7 +105,7 @@ def _to_copies(
     return np.asarray(R), np.asarray(T_est[:, None, :3, 3] - copies[..., :3, 3])
 
 
-def euler_deg(R: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+def euler_deg(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3"]:
     """Roll, pitch, yaw in degrees with `R = Rz(yaw) Ry(pitch) Rx(roll)`: roll and yaw in (-180, 180], pitch in +-90.
 
     This is PCL's convention (`getTranslationAndEulerAngles`); the paper does not name its own.

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from evalkit.tracking.residuals import Residuals, changes, euler_deg, residuals
 from evalkit.tracking.tracks import SequenceTrack
 
-Array = np.ndarray
 LIMIT_M, LIMIT_RAD = 0.05, np.deg2rad(5.0)
 """Limits of both errors of a tracked frame: RBOT's criterion."""
 AXES = ("x", "y", "z")
@@ -66,16 +65,16 @@ def track_scores(track: SequenceTrack) -> dict[str, float]:
     return result | {"time_ms_mean": _mean(1e3 * track.time_s[timed])}
 
 
-def _rms(errors: Residuals, is_estimated: Bool[Array, " n"]) -> dict[str, float]:
+def _rms(errors: Residuals, is_estimated: Bool[np.ndarray, " n"]) -> dict[str, float]:
     dt_m, angles = errors.dt_m[is_estimated], euler_deg(errors.R[is_estimated])
     translation_rms = {f"{axis}_rms_mm": 1e3 * np.sqrt(_mean(dt_m[:, i] ** 2)) for i, axis in enumerate(AXES)}
     rotation_rms = {f"{name}_rms_deg": np.sqrt(_mean(angles[:, i] ** 2)) for i, name in enumerate(ANGLES)}
     return {name: float(value) for name, value in (translation_rms | rotation_rms).items()}
 
 
-def _mean(values: Float[Array, " n"]) -> float:
+def _mean(values: Float[np.ndarray, " n"]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
-def _quantile(values: Float[Array, " n"], fraction: float) -> float:
+def _quantile(values: Float[np.ndarray, " n"], fraction: float) -> float:
     return float(np.quantile(values, fraction)) if len(values) else float("nan")

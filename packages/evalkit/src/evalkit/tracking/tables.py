@@ -12,8 +12,6 @@ from evalkit.tables.model import Cell, Interval, Row, Table, TableColumn
 from evalkit.tracking.scores import ANGLES, AXES, track_scores
 from evalkit.tracking.tracks import SequenceTrack
 
-Array = np.ndarray
-
 
 def _rms_column(key: str, heading: str, unit: str, about: str = "") -> TableColumn:
     return TableColumn(key=key, heading=heading, group="RMS", unit=unit, digits=2, better="lower", about=about)

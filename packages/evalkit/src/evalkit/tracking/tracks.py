@@ -15,8 +15,6 @@ from scipy.optimize import linear_sum_assignment
 from evalkit.inputs.pairing import instances_of
 from evalkit.inputs.result_files import ResultFile
 
-Array = np.ndarray
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SequenceTrack:
@@ -40,12 +38,12 @@ class SequenceTrack:
     obj_id: int
     instance: int
     name: str
-    im_id: Int[Array, " n"]
-    frame: Int[Array, " n"]
-    T_est: Float[Array, "n 4 4"]
-    T_gt: Float[Array, "n 4 4"]
-    time_s: Float[Array, " n"]
-    was_initialised: Bool[Array, " n"] | None
+    im_id: Int[np.ndarray, " n"]
+    frame: Int[np.ndarray, " n"]
+    T_est: Float[np.ndarray, "n 4 4"]
+    T_gt: Float[np.ndarray, "n 4 4"]
+    time_s: Float[np.ndarray, " n"]
+    was_initialised: Bool[np.ndarray, " n"] | None
     info: Symmetric | None
 
 
@@ -53,8 +51,8 @@ def tracks_of(
     dataset: BopDataset,
     file: ResultFile,
     table: pd.DataFrame,
-    T_est: Float[Array, "n 4 4"],
-    T_gt: Float[Array, "n 4 4"],
+    T_est: Float[np.ndarray, "n 4 4"],
+    T_gt: Float[np.ndarray, "n 4 4"],
 ) -> list[SequenceTrack]:
     """The sequences of a result file: one track for each object of each scene.
 
@@ -109,8 +107,12 @@ def tracks_of(
 
 
 def _were_initialised(
-    resets: set[tuple[int, int, int, int]] | None, im_id: Int[Array, " n"], scene_id: int, obj_id: int, instance: int
-) -> Bool[Array, " n"] | None:
+    resets: set[tuple[int, int, int, int]] | None,
+    im_id: Int[np.ndarray, " n"],
+    scene_id: int,
+    obj_id: int,
+    instance: int,
+) -> Bool[np.ndarray, " n"] | None:
     if resets is None:
         return None
     return np.array([(scene_id, image, obj_id, instance) in resets for image in im_id.tolist()], bool)
@@ -118,7 +120,7 @@ def _were_initialised(
 
 def frames_of(
     dataset: BopDataset, file: ResultFile, *, all_frames: bool = False
-) -> tuple[pd.DataFrame, Float[Array, "n 4 4"], Float[Array, "n 4 4"]]:
+) -> tuple[pd.DataFrame, Float[np.ndarray, "n 4 4"], Float[np.ndarray, "n 4 4"]]:
     """Every expected pose with its estimate, as arguments of `tracks_of`.
 
     Of the estimates of an object in an image those with the highest scores count, as many as there are instances; they

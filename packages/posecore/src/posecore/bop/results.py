@@ -38,7 +38,7 @@ RENAMED = {
     "start_lines": "initial_lines",
     "method=start": "method=initial",
     "settings.sure": "settings.tracking_threshold",
-    "settings.found": "settings.reacquire_threshold",
+    "settings.found": "settings.accept_threshold",
 }
 """Sidecar keys and values of version 0.1 by name, see `posecore.renamed`."""
 

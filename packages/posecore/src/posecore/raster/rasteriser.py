@@ -21,7 +21,6 @@ from posecore.raster.context import thread_device
 from posecore.raster.scene import HEADLIGHT, MAX_LIGHTS, Instance, Layers, SceneLayers, Shading
 from posecore.raster.shaders import DEPTH_FRAGMENT_SHADER, DEPTH_VERTEX_SHADER, FRAGMENT_SHADER, VERTEX_SHADER
 
-Array = np.ndarray
 P, R = ParamSpec("P"), TypeVar("R")
 MAX_IMAGES = 64
 """Framebuffers of one image size."""
@@ -108,9 +107,9 @@ class Rasteriser:
     @_drawing
     def render(
         self,
-        obj_id: int | Int[Array, " b"],
-        K: Float[Array, "*k 3 3"],
-        T_cam_obj: Float[Array, "b 4 4"],
+        obj_id: int | Int[np.ndarray, " b"],
+        K: Float[np.ndarray, "*k 3 3"],
+        T_cam_obj: Float[np.ndarray, "b 4 4"],
         width_px: int,
         height_px: int,
         *,
@@ -152,7 +151,7 @@ class Rasteriser:
     def render_scene(
         self,
         instances: Sequence[Instance],
-        K: Float[Array, "3 3"],
+        K: Float[np.ndarray, "3 3"],
         width_px: int,
         height_px: int,
         *,
@@ -202,7 +201,7 @@ class Rasteriser:
         self,
         instance: Instance,
         label: int,
-        K: Float[Array, "3 3"],
+        K: Float[np.ndarray, "3 3"],
         width_px: int,
         height_px: int,
         depth_range_m: tuple[float, float],
@@ -234,14 +233,14 @@ class Rasteriser:
         (texture or self._blank).use(0)
         coloured.render(moderngl.TRIANGLES)
 
-    def _read_rgb(self, target: moderngl.Framebuffer, size: tuple[int, int]) -> UInt8[Array, "h w 3"]:
+    def _read_rgb(self, target: moderngl.Framebuffer, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
         width, height = size
         data = target.read(viewport=(0, 0, width, height), components=3, attachment=0, alignment=1)
         return np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
     def _read_floats(
         self, target: moderngl.Framebuffer, size: tuple[int, int], attachment: int, components: int
-    ) -> Float[Array, "h w c"]:
+    ) -> Float[np.ndarray, "h w c"]:
         width, height = size
         viewport = (0, 0, width, height)
         data = target.read(viewport=viewport, components=components, attachment=attachment, dtype="f4", alignment=1)
@@ -309,8 +308,8 @@ class Rasteriser:
 
 
 def _clip_from_cam(
-    K: Float[Array, "3 3"], width_px: int, height_px: int, near_m: float, far_m: float
-) -> Float[Array, "4 4"]:
+    K: Float[np.ndarray, "3 3"], width_px: int, height_px: int, near_m: float, far_m: float
+) -> Float[np.ndarray, "4 4"]:
     """Projection to GL clip space with image row 0 at the framebuffer's first row, so nothing is flipped on reading."""
     w, h = float(width_px), float(height_px)
     depth_scale = (far_m + near_m) / (far_m - near_m)

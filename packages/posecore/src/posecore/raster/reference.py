@@ -5,12 +5,10 @@ from jaxtyping import Bool, Float
 
 from posecore.mesh import Mesh
 
-Array = np.ndarray
-
 
 def render(
-    mesh: Mesh, K: Float[Array, "3 3"], T_cam_obj: Float[Array, "4 4"], width_px: int, height_px: int
-) -> tuple[Float[Array, "h w"], Bool[Array, "h w"]]:
+    mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"], width_px: int, height_px: int
+) -> tuple[Float[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Camera z (metres, 0 = nothing) and silhouette, sampled at pixel centres (+0.5).
 
     Every vertex must lie in front of the camera. An edge that passes exactly through a pixel centre counts as inside.

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from posecore.errors import RenderError
 
-Array = np.ndarray
 MAX_LIGHTS = 8
 
 
@@ -40,7 +39,7 @@ class Instance:
     """One object of a scene: which mesh, where, and a factor on its colours."""
 
     obj_id: int
-    T_cam_obj: Float[Array, "4 4"]
+    T_cam_obj: Float[np.ndarray, "4 4"]
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
@@ -53,11 +52,11 @@ class Layers:
         depth_m: (b, h, w) camera z in metres, 0 where nothing was hit.
     """
 
-    rgb: UInt8[Array, "b h w 3"] | None
-    depth_m: Float[Array, "b h w"]
+    rgb: UInt8[np.ndarray, "b h w 3"] | None
+    depth_m: Float[np.ndarray, "b h w"]
 
     @property
-    def mask(self) -> Bool[Array, "b h w"]:
+    def mask(self) -> Bool[np.ndarray, "b h w"]:
         """Silhouettes."""
         return self.depth_m > 0
 
@@ -66,6 +65,6 @@ class Layers:
 class SceneLayers:
     """One render of several objects; `instance` indexes them, -1 where nothing was hit; `rgb` may not be asked for."""
 
-    rgb: UInt8[Array, "h w 3"] | None
-    depth_m: Float[Array, "h w"]
-    instance: Int[Array, "h w"]
+    rgb: UInt8[np.ndarray, "h w 3"] | None
+    depth_m: Float[np.ndarray, "h w"]
+    instance: Int[np.ndarray, "h w"]

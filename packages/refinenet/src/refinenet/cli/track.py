@@ -61,7 +61,7 @@ SHOWN_REASONS = 3
     help="Least confidence of a pose for the state tracking. [0.35, learned 0.5, search 0.4]",
 )  # fmt: skip
 @click.option(
-    "--reacquire-threshold", type=click.FloatRange(0, 1),
+    "--accept-threshold", type=click.FloatRange(0, 1),
     help="Least confidence of a pose that is accepted at all. [0.2, search 0.4]",
 )  # fmt: skip
 @click.option("--patience", type=click.IntRange(1), default=5, help="Frames without a pose until an object is lost.")
@@ -78,7 +78,7 @@ SHOWN_REASONS = 3
 @other_mesh_option
 @quiet_option
 @verbose_option
-@renamed_options({"--sure": "--tracking-threshold", "--found": "--reacquire-threshold"})
+@renamed_options({"--sure": "--tracking-threshold", "--found": "--accept-threshold"})
 def track(
     source: Path,
     method: MethodName,
@@ -95,7 +95,7 @@ def track(
     iterations: int,
     motion_model: bool,
     tracking_threshold: float | None,
-    reacquire_threshold: float | None,
+    accept_threshold: float | None,
     patience: int,
     depth_step: float | None,
     video: Path | None,
@@ -132,7 +132,7 @@ def track(
     job = TrackJob(
         method=settings, source=source, out=out, init=init, pose=pose, split=split, scene=scene, camera=camera,
         mesh_files=mesh_files, units=units, objects=objects, motion_model=motion_model,
-        tracking_threshold=tracking_threshold, reacquire_threshold=reacquire_threshold, patience=patience,
+        tracking_threshold=tracking_threshold, accept_threshold=accept_threshold, patience=patience,
         depth_step=depth_step, video=video, fps=fps, name=name, threads=threads,
     )  # fmt: skip
     with progress_bar(quiet) as bar:

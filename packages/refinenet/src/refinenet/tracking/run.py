@@ -46,7 +46,7 @@ class TrackJob:
         objects: Objects to track; all when empty.
         motion_model: Whether poses are predicted at constant velocity.
         tracking_threshold: Least confidence for the state `tracking`; None takes the method's default, also below.
-        reacquire_threshold: Least confidence of an accepted pose.
+        accept_threshold: Least confidence of an accepted pose.
         patience: Consecutive frames without an accepted pose until an object is lost.
         depth_step: Fraction of its depth by which each hypothesis is also shifted nearer and farther.
         video: Video file with contours and states.
@@ -71,7 +71,7 @@ class TrackJob:
     objects: tuple[int, ...] = ()
     motion_model: bool = False
     tracking_threshold: float | None = None
-    reacquire_threshold: float | None = None
+    accept_threshold: float | None = None
     patience: int = 5
     depth_step: float | None = None
     video: Path | None = None
@@ -85,7 +85,7 @@ class TrackJob:
             raise ConfigError(f"--method {method} takes no --checkpoint")
         if (self.init is None) == (self.pose is None):
             raise ConfigError("give either --init or --pose: the initial poses of the objects")
-        for name in ("tracking_threshold", "reacquire_threshold", "depth_step"):
+        for name in ("tracking_threshold", "accept_threshold", "depth_step"):
             if getattr(self, name) is not None and method not in WITH_CONFIDENCE:
                 option = f"--{name.replace('_', '-')}"
                 raise ConfigError(
@@ -233,14 +233,14 @@ def track_sequence(
 
 def _method_settings(job: TrackJob) -> MethodSettings:
     """The job's method; a global search fails below the reacquire threshold."""
-    if job.method.method in WITH_NETWORK and job.reacquire_threshold is not None:
-        return replace(job.method, min_confidence=job.reacquire_threshold)
+    if job.method.method in WITH_NETWORK and job.accept_threshold is not None:
+        return replace(job.method, min_confidence=job.accept_threshold)
     return job.method
 
 
 def _tracking_config(job: TrackJob, refiner: PoseRefiner) -> TrackingConfig:
     """The method's default thresholds, overridden by those of the job."""
-    names = ("tracking_threshold", "reacquire_threshold", "depth_step")
+    names = ("tracking_threshold", "accept_threshold", "depth_step")
     overrides = {name: value for name in names if (value := getattr(job, name)) is not None}
     return replace(default_config(refiner), patience=job.patience, **overrides)
 
@@ -264,7 +264,7 @@ def _sidecar(
             **refiner.settings,
             "motion_model": job.motion_model,
             "tracking_threshold": config.tracking_threshold,
-            "reacquire_threshold": config.reacquire_threshold,
+            "accept_threshold": config.accept_threshold,
             "patience_frames": config.patience,
             "depth_step": config.depth_step,
         },

@@ -26,22 +26,22 @@ class TrackingConfig:
 
     Attributes:
         tracking_threshold: least confidence of a pose for the state `tracking`.
-        reacquire_threshold: least confidence of a pose that is accepted at all.
+        accept_threshold: least confidence of a pose that is accepted at all.
         patience: consecutive frames without an accepted pose until the track is lost.
         depth_step: fraction of its depth by which each hypothesis is also shifted nearer and farther; 0 for none.
             With a network that hardly corrects depth, the pose would otherwise drift in depth from frame to frame.
     """
 
     tracking_threshold: float = 0.35
-    reacquire_threshold: float = 0.2
+    accept_threshold: float = 0.2
     patience: int = 5
     depth_step: float = 0.02
 
     def __post_init__(self) -> None:
-        if not 0 <= self.reacquire_threshold <= self.tracking_threshold <= 1:
+        if not 0 <= self.accept_threshold <= self.tracking_threshold <= 1:
             raise ConfigError(
-                f"reacquire_threshold is {self.reacquire_threshold} and tracking_threshold is "
-                f"{self.tracking_threshold}, expected 0 <= reacquire_threshold <= tracking_threshold <= 1"
+                f"accept_threshold is {self.accept_threshold} and tracking_threshold is "
+                f"{self.tracking_threshold}, expected 0 <= accept_threshold <= tracking_threshold <= 1"
             )
         if not 0 <= self.depth_step < 0.5:
             raise ConfigError(f"depth_step is {self.depth_step}, expected 0 to under 0.5")
@@ -51,11 +51,11 @@ class TrackingConfig:
 
 # Measured with gradient confidences on rendered frames of the example object: refined poses have about 0.5 (a tenth is
 # under 0.42), the ground-truth pose 0.65, a pose 40 degrees and 0.2 diameters off 0.05 with a deviation of 0.05.
-GRADIENT_TRACKING = TrackingConfig(tracking_threshold=0.35, reacquire_threshold=0.2)
-LEARNED_TRACKING = TrackingConfig(tracking_threshold=0.5, reacquire_threshold=0.2)
-SEARCH_TRACKING = TrackingConfig(tracking_threshold=0.4, reacquire_threshold=0.4, depth_step=0.0)
+GRADIENT_TRACKING = TrackingConfig(tracking_threshold=0.35, accept_threshold=0.2)
+LEARNED_TRACKING = TrackingConfig(tracking_threshold=0.5, accept_threshold=0.2)
+SEARCH_TRACKING = TrackingConfig(tracking_threshold=0.4, accept_threshold=0.4, depth_step=0.0)
 """For `search`, which fails below its own least similarity."""
-UNSCORED_TRACKING = TrackingConfig(tracking_threshold=0.5, reacquire_threshold=0.2, depth_step=0.0)
+UNSCORED_TRACKING = TrackingConfig(tracking_threshold=0.5, accept_threshold=0.2, depth_step=0.0)
 """For methods without confidences: every pose that does not fail is accepted, and no depth is better than another."""
 
 
@@ -77,7 +77,7 @@ def next_status(status: TrackStatus, confidence: float | None, config: TrackingC
         return TrackStatus()
     if status.state is TrackState.LOST:
         return status
-    if confidence is not None and confidence >= config.reacquire_threshold:
+    if confidence is not None and confidence >= config.accept_threshold:
         return TrackStatus(state=TrackState.UNCERTAIN)
     missed = status.missed + 1
     return TrackStatus(state=TrackState.LOST if missed >= config.patience else TrackState.UNCERTAIN, missed=missed)

@@ -13,7 +13,6 @@ from evalkit.report.svg_plots import LineStyle, Series
 from evalkit.scores.definitions import MSPD_WIDTH_PX
 from evalkit.scores.per_pose import add_s_m
 
-Array = np.ndarray
 NOTE = (
     "A curve shows the fraction of all expected poses with an error of at most the threshold, a missing estimate "
     "failing. Rotation errors are at the best symmetry."
@@ -26,14 +25,14 @@ WIDEST_MM = 300.0
 def figures(scored: Sequence[Scored], styles: Sequence[LineStyle]) -> str:
     """The curves of all result files."""
 
-    def figure(title: str, x_label: str, errors_of: Callable[[pd.DataFrame], Array], limit: float) -> str:
+    def figure(title: str, x_label: str, errors_of: Callable[[pd.DataFrame], np.ndarray], limit: float) -> str:
         lines = []
         for item, style in zip(scored, styles, strict=True):
             x, y = svg_plots.cumulative(errors_of(item.table), limit)
             lines.append(Series(name=item.file.name, style=style, x=x, y=y))
         return svg_plots.line_plot(title, x_label, "fraction of poses", lines, is_fraction=True)
 
-    def millimetres(name: str) -> Callable[[pd.DataFrame], Array]:
+    def millimetres(name: str) -> Callable[[pd.DataFrame], np.ndarray]:
         return lambda table: np.asarray(np.abs(column(table, name)) * 1e3)
 
     drawn = [
@@ -51,7 +50,7 @@ def figures(scored: Sequence[Scored], styles: Sequence[LineStyle]) -> str:
     return f'{html.paragraph(NOTE, soft=True)}<div class="plots">{"".join(drawn)}</div>'
 
 
-def _mspd_px(table: pd.DataFrame) -> Float[Array, " n"]:
+def _mspd_px(table: pd.DataFrame) -> Float[np.ndarray, " n"]:
     return np.asarray(column(table, "mspd_px") * (MSPD_WIDTH_PX / column(table, "image_width_px")))
 
 
