@@ -334,7 +334,7 @@ def test_meshes_with_any_bytes(tmp_path, original, change):
         (b"\n30 20 15\n", b"\n30 20-15\n", "the vertex is '30 20-15', expected numbers"),
         (b"\n30 20 15\n", b"\n30 20 15 9\n", "the vertex has 4 numbers, its header gives 3"),
         (b"\n30 20 15\n", b"\n\n30 20 15\n", "the vertex has 0 numbers, its header gives 3"),
-        (b"3 1 7 3\n", b"3 1 7.9 3\n", "names a vertex by something that is no whole number"),
+        (b"3 1 7 3\n", b"3 1 7.9 3\n", "names a vertex by something that is not a whole number"),
         (b"3 1 7 3\n", b"2 1 7 3\n", "the face has 4 numbers, its header gives 3"),
         pytest.param(b"3 1 7 3\n", b"9" * 5000 + b" 1 7 3\n", "has no count of its list", id="endless count"),
         pytest.param(ascii_ply()[-120:], b"", "of 'vertex', its header gives 8; the file is cut off", id="cut"),

@@ -179,7 +179,7 @@ def test_what_is_no_pose_fails_with_the_reason(name, mesh, frame):
     behind[2, 3] *= -1
     lost[0, 0] = np.nan
     reasons = {
-        "its rotation is none: scaled, mirrored or sheared": [mirrored, scaled],
+        "its upper 3 x 3 block is not a rotation: it is scaled, mirrored or sheared": [mirrored, scaled],
         "were millimetres taken for metres?": [micro],
         "it is behind the camera or reaches it": [behind],
         "its pose is not finite": [lost],

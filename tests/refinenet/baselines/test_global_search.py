@@ -72,7 +72,7 @@ def test_where_the_object_is_not_it_fails(tug, seen):
     (result,) = refiner.refine_batch(replace(frame, image=image), [Request(obj_id=1, T_cam_obj=start)])
     refiner.close()
     assert result.failed
-    agreement = re.search(r"its gradient similarity is (0\.\d{3}) at most, 0\.4 needed", result.failure)
+    agreement = re.search(r"its gradient similarity is (0\.\d{3}) at most, below the minimum of 0\.4", result.failure)
     assert agreement and 0.1 < float(agreement[1]) < 0.4, result.failure
     np.testing.assert_array_equal(result.T_cam_obj, start)
 
@@ -175,7 +175,7 @@ def test_predicted_pose_quality_counts_in_the_choice(tug, seen, monkeypatch):
     assert nowhere.failed
     assert len(nowhere.candidates) == len(asked.asked)
     assert max(one.confidence for one in nowhere.candidates) < 0.5
-    assert re.search(r"its combined score is 0\.\d{3} at most, 0\.5 needed", nowhere.failure)
+    assert re.search(r"its combined score is 0\.\d{3} at most, below the minimum of 0\.5", nowhere.failure)
 
 
 def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, repository, tmp_path):
@@ -196,7 +196,7 @@ def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, re
     assert distances(tug, truth, found.T_cam_obj) < 0.1
     result = cli("refine", "--method", "search", *rest, "--iterations", 1, "--min-confidence", 0.99)
     assert "its gradient similarity is 0." in result.stderr
-    assert "at most, 0.99 needed" in result.stderr
+    assert "at most, below the minimum of 0.99" in result.stderr
     assert (len(read_results(tmp_path / "x.csv")), read_sidecar(tmp_path / "x.csv")["failed_lines"]) == (0, [2])
     assert read_sidecar(tmp_path / "x.csv")["settings"]["min_confidence"] == 0.99
     candidates = ["--candidates", tmp_path / "all.csv", "--keep-failed"]

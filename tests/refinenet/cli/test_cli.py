@@ -33,7 +33,7 @@ def test_train_command(cli, dataset, tmp_path):
     assert str(out / "best.safetensors") in result.stdout
     again = cli("train", dataset, "--out", out, *SMALL)
     assert again.exit_code == 2
-    assert "holds a run already" in again.stderr
+    assert "already holds a run" in again.stderr
     assert cli("train", dataset, "--out", out, *SMALL, "--resume").exit_code == 0
 
 

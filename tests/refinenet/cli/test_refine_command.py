@@ -105,7 +105,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     result = cli("refine", *arguments[:-2], "--iterations", 1, "--min-confidence", between)
     assert "2 failed" in result.stdout
     doubted, sidecar = min(kept[:2], key=lambda estimate: estimate.score), read_sidecar(out)
-    why = f"after 1 updates its confidence is {doubted.score:.3f}, {between:g} needed"
+    why = f"after 1 updates its confidence, {doubted.score:.3f}, is below the minimum of {between:g}"
     assert sidecar["failures"][str(doubted.line)] == why
     assert sidecar["initial_lines"] == [{2: 3, 3: 2}[doubted.line]]
 
@@ -163,10 +163,10 @@ def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
         (["--checkpoint", trained, *rest, "--object", "5"], 2, "no pose of object 5"),
         (["--checkpoint", trained, *rest, "--hypotheses", 4, "--scorer", "learned"], 1, "no confidence output"),
         (["--checkpoint", trained, "--dataset", tmp_path / "no", *rest[2:]], 1, "no such folder"),
-        (["--checkpoint", trained, *rest, "--scorer", "none"], 2, "--scorer does nothing with one hypothesis, see --h"),
-        (["--checkpoint", trained, *rest, "--seed", 1], 2, "--seed does nothing with one hypothesis"),
-        (["--method", "region", *rest, "--batch", 8], 2, "--batch does nothing for --method region without a network"),
-        (["--method", "search", *rest, "--seed", 8], 2, "--seed does nothing for --method search: leave it out"),
+        (["--checkpoint", trained, *rest, "--scorer", "none"], 2, "--scorer has no effect with one hypothesis, see --h"),
+        (["--checkpoint", trained, *rest, "--seed", 1], 2, "--seed has no effect with one hypothesis"),
+        (["--method", "region", *rest, "--batch", 8], 2, "--batch has no effect for --method region without a network"),
+        (["--method", "search", *rest, "--seed", 8], 2, "--seed has no effect for --method search; leave it out"),
     ):
         result = cli("refine", *arguments)
         assert result.exit_code == code, result.output

@@ -48,7 +48,7 @@ def test_settings_without_effect_are_refused(job):
     edges = MethodSettings(method="edge-icp")
     with pytest.raises(ConfigError, match="give either --init or --pose"):
         TrackJob(method=edges, **common)
-    with pytest.raises(ConfigError, match="--depth-step does nothing for --method edge-icp, which has no confidences"):
+    with pytest.raises(ConfigError, match="--depth-step has no effect for --method edge-icp, which has no confidences"):
         TrackJob(method=edges, init=job.init, depth_step=0.1, **common)
     search = MethodSettings(method="search", checkpoint=job.method.checkpoint)
     with pytest.raises(ConfigError, match="--method search takes no --checkpoint"):

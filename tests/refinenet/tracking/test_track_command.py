@@ -250,7 +250,7 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
         ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
         ([root, *init, *camera], 2, "--camera is for images and videos"),
-        ([root, *init, "--fps", 10], 2, "--fps does nothing without --video: leave it out"),
+        ([root, *init, "--fps", 10], 2, "--fps has no effect without --video; leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
         ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 is probably in metres"),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
@@ -265,15 +265,15 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     assert cli("track", root, "--checkpoint", still, "--out", tmp_path / "x.csv").exit_code == 2
     assert "needs a --checkpoint" in cli("track", root, *init, "--out", tmp_path / "x.csv").stderr
     edges = ["--method", "edge-icp", "--allow-other-mesh", "--out", tmp_path / "x.csv"]
-    assert "--allow-other-mesh does nothing for --method edge-icp" in cli("track", root, *init, *edges).stderr
+    assert "--allow-other-mesh has no effect for --method edge-icp" in cli("track", root, *init, *edges).stderr
     (tmp_path / "none.json").write_text("[]")
     shutil.copy(root / "pose.json", tmp_path / "x.json")
     for arguments, text in (
         (
             ["--method", "edge-icp", *init, "--tracking-threshold", 0.9],
-            "--tracking-threshold does nothing for --method edge-icp, which has no",
+            "--tracking-threshold has no effect for --method edge-icp, which has no",
         ),
-        (["--method", "edge-icp", *init, "--depth-step", 0.1], "--depth-step does nothing for --method edge-icp"),
+        (["--method", "edge-icp", *init, "--depth-step", 0.1], "--depth-step has no effect for --method edge-icp"),
         (["--method", "edge-icp", *init, "--object", 1, "--object", 9], "no pose of object 9 for scene 1"),
         (
             ["--method", "edge-icp", "--pose", tmp_path / "none.json"],

@@ -80,7 +80,7 @@ def test_a_resumed_run_ends_with_the_same_weights(run, dataset, tmp_path):
 
 def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_path):
     out = run[0]
-    with pytest.raises(ConfigError, match="holds a run already; go on with --resume"):
+    with pytest.raises(ConfigError, match="already holds a run; continue it with --resume"):
         train(small(), str(dataset), out)
     with pytest.raises(ConfigError, match=r"seed was 0 and is now 1; resume with the same settings"):
         train(small("seed=1"), str(dataset), out, resume=True)

@@ -58,7 +58,7 @@ def test_all_pairs_are_there_in_order_and_no_scene_is_two(parts, tmp_path):
     shown = info_text(dataset_info(str(out)))
     assert "part:         10 pairs" in shown
     assert "settings" not in shown
-    with pytest.raises(ShardError, match="is merged of 2 datasets; verify each of those"):
+    with pytest.raises(ShardError, match="was merged from 2 datasets; verify those"):
         verify(str(out))
 
 

@@ -29,7 +29,7 @@ def refuse_broken_ply(file: Path, data: bytes) -> None:
         data: its bytes.
 
     Raises:
-        MeshError: rows are missing, or one holds something that is no number, too few or too many; names the line.
+        MeshError: rows are missing, or one holds something that is not a number, too few or too many; names the line.
     """
     head, end, body = data.partition(b"end_header")
     lines = head.decode("ascii", "replace").splitlines()
@@ -84,7 +84,7 @@ def _wrong_row(text: bytes, element: _Element) -> str:
         size = int(words[position])
         inside = words[position + 1 : position + 1 + size]
         if element.name == "face" and position == 0 and not all(word.isdigit() for word in inside):
-            return "names a vertex by something that is no whole number"
+            return "names a vertex by something that is not a whole number"
         position += 1 + size
     return "" if position == len(words) else f"has {len(words)} numbers, its header gives {position}"
 

@@ -16,7 +16,7 @@ class NetworkInput(NamedTuple):
         hypothesis_rgb: (b, 3, p, p) render of the object alone on black, same window.
         T_cam_obj: (b, 4, 4) hypothesis, metres.
         K_crop: (b, 3, 3) intrinsics of the patch.
-        hypothesis_depth_m: (b, p, p) camera z of the render, 0 on the background; None where it is no input.
+        hypothesis_depth_m: (b, p, p) camera z of the render, 0 on the background; None where it is not an input.
     """
 
     scene_rgb: UInt8[Tensor, "b 3 p p"]

@@ -56,7 +56,7 @@ class Frame:
 
     Raises:
         RefinementError: The image is not 8-bit RGB, or the depth has another size.
-        CameraError: K is no camera matrix, or that of an image of another size.
+        CameraError: K is not a camera matrix, or belongs to an image of another size.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -125,7 +125,7 @@ def render_obstacle(T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh) -> str | No
     if not np.isfinite(T_cam_obj).all():
         return "its pose is not finite"
     if not se3.is_rotation(T_cam_obj[:3, :3], ROTATION_TOLERANCE):
-        return "its rotation is none: scaled, mirrored or sheared"
+        return "its upper 3 x 3 block is not a rotation: it is scaled, mirrored or sheared"
     z_m = float(T_cam_obj[2, :3] @ mesh.center_m + T_cam_obj[2, 3])
     if z_m < NEAREST_DIAMETERS * mesh.diameter_m:
         unit = "; were metres taken for millimetres?" if 0 < z_m < SUSPICIOUS_M else ""

@@ -22,7 +22,7 @@ DIAMETER_TOLERANCE = 5e-3
 EVAL_DIAMETER_TOLERANCE = 2e-2
 """The same for simplified models against the full ones' numbers."""
 MEAN_DISTANCE = 0.02
-"""Smallest mean distance, in diameters, between a surface and its image under a transform that is no symmetry.
+"""Smallest mean distance, in diameters, between a surface and its image under a transform that is not a symmetry.
 
 Sampling alone gives 0.005; LM-O's two symmetries 0.008 and 0.010; 180 degrees about another axis 0.025 or more.
 """

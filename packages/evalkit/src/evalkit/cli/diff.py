@@ -33,8 +33,8 @@ RESULTS = click.Path(path_type=Path, dir_okay=False)
 @click.option("--html", "html_file", type=NEW_FILE, help="Write a page with pictures.")
 @click.option("--list", "listed", type=click.IntRange(0), default=10, help="Poses to list of each kind.")
 @click.option("--pictures", type=click.IntRange(0, 200), default=12, help="Pictures of each kind.")
-@click.option("--resamples", type=click.IntRange(1), default=1000, help="Of the bootstrap.")
-@click.option("--seed", type=click.IntRange(0), default=0, help="Of the bootstrap.")
+@click.option("--resamples", type=click.IntRange(1), default=1000, help="Number of bootstrap resamples.")
+@click.option("--seed", type=click.IntRange(0), default=0, help="Random seed of the bootstrap.")
 @verbose_option
 def diff(
     a: Path,

@@ -73,7 +73,7 @@ def parse_rule(text: str) -> Rule:
     """Read `NAME OPERATOR NUMBER` or `STATISTIC(NAME) OPERATOR NUMBER`.
 
     Raises:
-        ConfigError: the text is no rule, or its name or statistic is unknown; the message lists the valid ones.
+        ConfigError: the text is not a rule, or its name or statistic is unknown; the message lists the valid ones.
     """
     match = RULE.fullmatch(text)
     if match is None:

@@ -131,7 +131,7 @@ def read_errors(path: Path, name: str | None = None) -> Side:
         name: of the result file in the table's column `results`; not needed for a single one.
 
     Raises:
-        ResultFileError: columns are missing, or a value is no number.
+        ResultFileError: columns are missing, or a value is not a number.
         ConfigError: the table holds several result files and `name` is None or none of their names.
     """
     rows = _rows(path)

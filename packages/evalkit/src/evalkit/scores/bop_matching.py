@@ -43,7 +43,7 @@ class AllErrors:
             objects that the image does not contain.
         instances: `scene_id`, `im_id`, `obj_id`, `gt_index`, `visib_fract` (NaN where unknown), `inst_count` (number
             of this object in the image's target, 0 without one), `diameter_m`, `image_width_px`: one
-            row for each annotated instance with a pose, also those that are no target.
+            row for each annotated instance with a pose, also those that are not targets.
         errors: `estimate` and `instance` (positions in the two tables), `mssd_m`, `mspd_px` and, where there is depth,
             `vsd_0.05` ... `vsd_0.50`: one row for each estimate and each instance of its object in its image.
     """

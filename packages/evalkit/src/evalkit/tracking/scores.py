@@ -26,7 +26,7 @@ TRACKING_DEFINITIONS: Mapping[str, str] = {
     "frames beside a lost frame or an initialisation",
     "symmetries": "the residual is to the symmetry-equivalent ground truth with the smallest angle, of equal ones to "
     "the one nearest to the residual of the previous frame; jitter is measured to the one nearest to the previous "
-    "frame, so that a smooth rotation from one to the next is no jitter",
+    "frame, so that a smooth rotation from one to the next is not jitter",
 }
 
 

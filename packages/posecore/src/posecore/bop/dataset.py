@@ -193,7 +193,7 @@ class BopDataset:
         """Intrinsics of an image; the size is that of the image file, else that in `camera.json`.
 
         Raises:
-            DatasetError: the image has no camera, it is no pinhole, or its size is given nowhere.
+            DatasetError: the image has no camera, it is not a pinhole camera, or its size is given nowhere.
         """
         self._require(scene_id)
         entry, where = self._source.entry(scene_id, im_id, "camera")

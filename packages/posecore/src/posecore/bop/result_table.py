@@ -199,7 +199,7 @@ def _plain_numbers(
     if not inside or not (starts[:, -1] < newlines).all() or not (starts[1:, 0] > newlines[:-1]).all():
         return None
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # it stops at the first thing that is no number
+        warnings.simplefilter("ignore", DeprecationWarning)  # it stops at the first thing that is not a number
         try:
             values = np.fromstring(plain.replace(b",", b" "), np.float64, sep=" ")
         except ValueError:

@@ -341,7 +341,7 @@ def visible_targets(root: str | Path, split: str, scene_id: int, min_visible: fl
     """Targets of a scene: each object of an image with the number of instances that are visible enough.
 
     The rule is that of bop_toolkit's enumerate_test_targets: instances count from a visible fraction of 0.1, and an
-    object without one is no target.
+    object without one is not a target.
 
     Args:
         root: dataset folder.

@@ -38,7 +38,7 @@ class ShardReader:
         group = self._store.get(GROUP)
         if group is None:
             raise ShardError(
-                f"{self.url}: no {GROUP} here, so this is no shard dataset; make one with `synthgen render`"
+                f"{self.url}: no {GROUP} here, so this is not a shard dataset; make one with `synthgen render`"
             )
         self.card = read_card(self.url, group)
         self.refresh()

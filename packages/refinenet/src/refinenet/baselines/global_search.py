@@ -155,7 +155,7 @@ class GradientSearch(Baseline):
         iterations = rounds + sum(candidate.iterations for candidate in scored)
         if _confidence(best) < self._min_confidence:
             score = "its combined score is" if self._has_quality else "its gradient similarity is"
-            reason = f"{score} {_confidence(best):.3f} at most, {self._min_confidence:g} needed"
+            reason = f"{score} {_confidence(best):.3f} at most, below the minimum of {self._min_confidence:g}"
             return replace(failed(T_cam_obj, iterations, reason), candidates=scored)
         return replace(best, iterations=iterations, candidates=scored)
 

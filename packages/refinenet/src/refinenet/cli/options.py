@@ -66,7 +66,7 @@ def require_used(why: str, *names: str) -> None:
     for option in context.command.params:
         is_set = context.get_parameter_source(str(option.name)) is ParameterSource.COMMANDLINE
         if option.name in names and is_set:
-            raise click.UsageError(f"{option.opts[-1]} does nothing {why}: leave it out")
+            raise click.UsageError(f"{option.opts[-1]} has no effect {why}; leave it out")
 
 
 def refuse_unused_network_options(settings: MethodSettings) -> None:

@@ -54,10 +54,14 @@ SHOWN_FAILURES = 5
 @click.option("--object", "objects", type=int, multiple=True, help="Refine only this object's poses. Repeatable. [all]")
 @click.option(
     "--min-confidence", type=click.FloatRange(0, 1),
-    help="Least confidence; a less confident pose fails. [network: 0, search: 0.4, search with a network that predicts "
-    "pose quality: 0.5]",
+    help="Minimum confidence; poses below it count as failed. [network: 0, search: 0.4, search with a network that "
+    "predicts pose quality: 0.5]",
 )  # fmt: skip
-@click.option("--keep-failed", is_flag=True, help="Write the initial pose of a failed one, with score 0. [left out]")
+@click.option(
+    "--keep-failed",
+    is_flag=True,
+    help="Where refinement fails, write the initial pose with score 0 instead of leaving it out. [left out]",
+)
 @click.option("--name", help="Method's name in the report. [the preset and the checkpoint's step]")
 @click.option("--overlay", type=FILE, metavar="DIR", help="Draw initial (red) and refined (green) contours here.")
 @click.option(

@@ -36,7 +36,11 @@ log = logging.getLogger(__name__)
 @click.option("--steps", type=click.IntRange(1), help="Optimiser steps. [preset]")
 @click.option("--batch", type=click.IntRange(1), help="Pairs in a batch, on each rank. [preset]")
 @click.option("--loss", type=click.Choice(get_args(LossName)), help="Loss. [preset]")
-@click.option("--seed", type=click.IntRange(0), help="Of weights, order, hypotheses, augmentation. [preset, 0]")
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    help="Random seed of initial weights, data order, hypotheses and augmentation. [preset, 0]",
+)
 @click.option("--workers", type=click.IntRange(0), help="Loader processes; 0 loads in the training process. [preset]")
 @click.option("--threads", type=click.IntRange(0), help="Torch threads; 0 leaves torch's choice. [preset, 0]")
 @click.option("--device", type=click.Choice(get_args(DeviceName)), help="Where the network runs. [preset, auto]")

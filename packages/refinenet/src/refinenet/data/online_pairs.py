@@ -215,7 +215,7 @@ class OnlinePairMaker:
             affine = crop_affine(stored, stored_px, sample["K"], rotation, window, self._patch_px)
             bits = warp(sample["scene_mask"], affine, self._patch_px, nearest=True)
             valid = warp(np.ones((stored_px, stored_px), np.uint8), affine, self._patch_px, nearest=True) > 0
-            # Where the stored patch ends the silhouette is cut, which is no contour: outside counts as object.
+            # Where the stored patch ends the silhouette is cut, which is not a contour: outside counts as object.
             outline = contour.contour_mask(((bits & BIT_OBJECT) > 0) | ~valid) & valid
             if outline.sum() >= MIN_CONTOUR_PX:
                 return _Draft(

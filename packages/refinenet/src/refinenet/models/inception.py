@@ -204,7 +204,7 @@ def load_pretrained(stem: Stem, name: str, weights: str | None) -> None:
     """Fill a stem with ImageNet weights, from a file or, for inception_v4, from the Hugging Face hub.
 
     Raises:
-        CheckpointError: the file is no match for the stem.
+        CheckpointError: the file does not match the stem.
         ConfigError: no file was named and the hub cannot be reached or has none for this stem.
     """
     ways = "name a file with --backbone-weights FILE, or train without with --set backbone.pretrained=false"

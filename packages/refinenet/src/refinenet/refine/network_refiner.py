@@ -169,9 +169,9 @@ class Refiner:
             obj_id: Object.
 
         Raises:
-            CameraError: K is no camera matrix, or that of an image of another size.
+            CameraError: K is not a camera matrix, or belongs to an image of another size.
             ConfigError: The object has no mesh here.
-            RefinementError: The image is no 8-bit RGB, or the GPU's memory is too small for a single pose.
+            RefinementError: The image is not 8-bit RGB, or the GPU's memory is too small for a single pose.
         """
         return self.refine_batch(Frame(image=image, K=K), [Request(obj_id=obj_id, T_cam_obj=T_cam_obj)])[0]
 
@@ -193,7 +193,7 @@ class Refiner:
         confidences = dict(zip(rows.tolist(), scores.tolist(), strict=True))
         for row, reason in zip(rows.tolist(), failures, strict=True):
             if reason is None and confidences[row] < self._min_confidence:
-                reason = f"its confidence is {confidences[row]:.3f}, {self._min_confidence:g} needed"
+                reason = f"its confidence, {confidences[row]:.3f}, is below the minimum of {self._min_confidence:g}"
             batch.failures[row] = reason and f"after {batch.iterations[row]} updates {reason}"
         return [
             Refinement(

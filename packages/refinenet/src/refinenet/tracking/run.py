@@ -89,7 +89,7 @@ class TrackJob:
             if getattr(self, name) is not None and method not in WITH_CONFIDENCE:
                 option = f"--{name.replace('_', '-')}"
                 raise ConfigError(
-                    f"{option} does nothing for --method {method}, which has no confidences: leave it out"
+                    f"{option} has no effect for --method {method}, which has no confidences; leave it out"
                 )
 
 
@@ -232,7 +232,7 @@ def track_sequence(
 
 
 def _method_settings(job: TrackJob) -> MethodSettings:
-    """The job's method; a global search fails below the reacquire threshold."""
+    """The job's method; a global search fails below the accept threshold."""
     if job.method.method in WITH_NETWORK and job.accept_threshold is not None:
         return replace(job.method, min_confidence=job.accept_threshold)
     return job.method

@@ -50,7 +50,7 @@ def train(
         LoaderError: A loader process died, or shared memory is too small for its batches.
     """
     if not resume and (out / "last.safetensors").exists():
-        raise ConfigError(f"{out}: holds a run already; go on with --resume, or choose another --out")
+        raise ConfigError(f"{out}: already holds a run; continue it with --resume, or choose another --out")
     if resume and not (out / "last.safetensors").exists():
         raise CheckpointError(f"{out}: no run to resume, last.safetensors is missing; leave --resume out to start one")
     with worker_failures(), process_group(config):

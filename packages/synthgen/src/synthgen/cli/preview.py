@@ -8,7 +8,7 @@ import click
 @click.command()
 @click.argument("dataset", type=str)
 @click.option("--out", required=True, type=click.Path(path_type=Path), metavar="FILE", help="Picture to write, .png.")
-@click.option("--count", type=click.IntRange(1, 200), default=8, help="Samples to show, one a row.")
+@click.option("--count", type=click.IntRange(1, 200), default=8, help="Samples to show, one per row.")
 @click.option("--first", type=click.IntRange(0), default=0, help="Index of the first sample.")
 def preview(dataset: str, out: Path, count: int, first: int) -> None:
     """Draw a contact sheet of a shard DATASET: patches with contours, distance transforms, masks and depth.

@@ -224,7 +224,7 @@ def _gl() -> tuple[MachineCheck, bool]:
         MachineCheck(
             name="GL",
             state="warning",
-            text=f"{device}, drawn by the processor: hypotheses, labels and the engines raster and eevee are slower",
+            text=f"{device}, software rendering on the CPU: hypotheses, labels, raster and eevee are slower",
             remedy="on a machine with a GPU, install its driver with EGL; keep to one kind within a dataset",
         ),
         True,

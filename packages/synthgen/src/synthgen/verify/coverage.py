@@ -50,7 +50,7 @@ def measure_coverage(batch: SampleBatch) -> dict[str, np.ndarray]:
 
 
 def joined(parts: Sequence[Coverage]) -> dict[str, np.ndarray]:
-    """Rows of several shards after one another."""
+    """Rows of several shards, concatenated."""
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]} if parts else {}
 
 

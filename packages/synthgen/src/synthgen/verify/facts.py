@@ -88,7 +88,7 @@ def load_facts(reader: ShardReader) -> Facts:
     """
     card = migrated_card(reader.card)
     if "merged" in card:
-        raise ShardError(f"{reader.url}: is merged of {len(card['merged'])} datasets; verify each of those instead")
+        raise ShardError(f"{reader.url}: was merged from {len(card['merged'])} datasets; verify those instead")
     try:
         camera = card["camera"]
         K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])

@@ -103,7 +103,7 @@ def verify(
         url: Folder or fsspec URL.
         samples: Number of samples to re-render; all when there are fewer.
         seed: Seed of their choice.
-        allow_incomplete: Whether missing shards are no failure.
+        allow_incomplete: Whether missing shards are allowed.
         workers: Processes. The report does not depend on it.
         on_shard: Called with each shard's number of samples.
 

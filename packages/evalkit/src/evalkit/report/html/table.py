@@ -66,7 +66,7 @@ def _row(described: Table, row: Row, best: set[str]) -> str:
             cells.append(f'<th scope="row" class="text" title="{escape(text)}">{escape(text)}</th>')
             continue
         number = number_of(cell)
-        # With an interval the cell's text is no number, so sorting needs the value.
+        # With an interval the cell's text is not a number, so sorting needs the value.
         value = f' data-value="{number:.9g}"' if ends and not is_text and number is not None else ""
         marks = _classes(
             "text" if is_text else "",
