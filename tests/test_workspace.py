@@ -43,7 +43,8 @@ ORDER = {  # folders and top-level modules of a package in the order of its work
     ),
     "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (
-        "errors device batch refiner config geometry image models data training baselines refine tracking cli __main__"
+        "renamed errors device batch refiner config geometry image models data training baselines refine tracking cli "
+        "__main__"
     ),
     "evalkit": (
         "error_table inputs pose_errors scores evaluation tables report diff check tracking cli"

@@ -137,3 +137,12 @@ def test_the_bar_has_more_columns_at_its_end():
     bar.add_task("pairs", total=3, state="loss 0.1")
     cells = [column.render(bar.tasks[0]) for column in bar.columns if hasattr(column, "text_format")]
     assert [cell.plain for cell in cells] == ["pairs", "left", "loss 0.1"]
+
+
+def test_nothing_is_printed_before_the_first_visible_task(capsys):
+    with progress_bar(False) as bar:
+        bar.add_task("pairs", total=None, visible=False)
+    assert capsys.readouterr().err == ""
+    with progress_bar(False) as bar:
+        bar.update(bar.add_task("pairs", total=None, visible=False), total=3, completed=3, visible=True)
+    assert "3/3" in capsys.readouterr().err

@@ -301,6 +301,15 @@ def test_a_shard_without_scenes_is_left_out_from_the_start(dataset, tmp_path):
     assert np.array_equal(DataRecord.load(tmp_path / "run").shards, [0, 1, 2, 3, 5])
 
 
+def test_skipped_shards_are_reported_also_when_no_split_is_possible(dataset, tmp_path, caplog):
+    copy = shutil.copytree(dataset, tmp_path / "copy")
+    for shard in range(6):
+        (copy / f"scene_index/c/{shard}").unlink()
+    with caplog.at_level(logging.WARNING), pytest.raises(ShardError):
+        open_run(small("loader.skip_bad_shards=true"), str(copy), tmp_path / "run")
+    assert caplog.text.count("skipped: ") == 6
+
+
 def test_urls_stream_what_a_folder_does(dataset):
     split = split_by_scene(ShardReader(str(dataset)), 0.2, 0)[0]
     here = take(make_stream(dataset, split), 3)

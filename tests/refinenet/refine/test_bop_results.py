@@ -1,5 +1,6 @@
 """Refinement of a result file, called from Python."""
 
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 from posecore.bop import read_results, read_sidecar
 from posecore.errors import ConfigError, DatasetError
 from refinenet.refine import MethodSettings, RefineJob, refine_result_file
+from refinenet.renamed import MODULES
 
 from .test_workers import columns
 
@@ -94,3 +96,11 @@ def test_the_commands_import_torch_only_to_run():
 def test_old_module_names_are_refused_with_the_new():
     with pytest.raises(ImportError, match=r"refinenet\.methods is now refinenet\.refiner"):
         import refinenet.methods  # noqa: F401
+    with pytest.raises(ImportError, match=r"refinenet\.tracking\.TrackingConfig is now refinenet\.tracking\.state"):
+        from refinenet.tracking import TrackingConfig  # noqa: F401
+
+
+def test_every_old_module_name_has_a_new_one_that_exists():
+    for new in MODULES.values():
+        for name in new.split(" and "):
+            pkgutil.resolve_name(name)

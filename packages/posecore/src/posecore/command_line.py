@@ -109,7 +109,9 @@ def end_early(stopped: BaseException, kept: str | None) -> NoReturn:
 
 
 def progress_bar(quiet: bool, *extra: str) -> "Progress":
-    """A bar on stderr with count, rate, elapsed and remaining time.
+    """A bar on stderr with count, rate, elapsed and remaining time, as a context.
+
+    It starts with the first visible task: an error before that stays on a line of its own.
 
     Args:
         quiet: Whether nothing is shown.
@@ -119,7 +121,6 @@ def progress_bar(quiet: bool, *extra: str) -> "Progress":
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
-        Progress,
         ProgressColumn,
         Task,
         TextColumn,
@@ -134,7 +135,7 @@ def progress_bar(quiet: bool, *extra: str) -> "Progress":
         def render(self, task: Task) -> Text:
             return Text(f"{task.speed:.2f}/s" if task.speed else "-/s")
 
-    return Progress(
+    return _late_progress()(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -147,3 +148,33 @@ def progress_bar(quiet: bool, *extra: str) -> "Progress":
         disable=quiet,
         speed_estimate_period=120,
     )
+
+
+def _late_progress() -> "type[Progress]":
+    from rich.progress import Progress, TaskID
+
+    class LateProgress(Progress):
+        """Starts with its first visible task; stopping without one would print an empty line."""
+
+        def start(self) -> None:
+            if any(task.visible for task in self.tasks):
+                super().start()
+
+        def stop(self) -> None:
+            if self.live.is_started:
+                super().stop()
+
+        def add_task(self, *args: Any, **kwargs: Any) -> TaskID:
+            task = super().add_task(*args, **kwargs)
+            self.start()
+            return task
+
+        def update(self, *args: Any, **kwargs: Any) -> None:
+            super().update(*args, **kwargs)
+            self.start()
+
+        def reset(self, *args: Any, **kwargs: Any) -> None:
+            super().reset(*args, **kwargs)
+            self.start()
+
+    return LateProgress

@@ -2,12 +2,8 @@
 
 from posecore.renamed import refuse_renamed_modules
 
+from refinenet.renamed import MODULES
+
 __version__ = "0.1.0"
 
-refuse_renamed_modules(
-    {
-        "refinenet.methods": "refinenet.refiner and refinenet.refine.registry",
-        "refinenet.tracker": "refinenet.tracking.tracker",
-        "refinenet.views": "refinenet.refine.patches",
-    }
-)
+refuse_renamed_modules(MODULES)

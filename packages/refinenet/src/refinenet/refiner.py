@@ -16,7 +16,7 @@ from refinenet.errors import RefinementError
 
 HypothesisScorer = Literal["gradient", "learned", "none"]
 """Ranking of a hypothesis set before refinement: image gradients, the network's confidence, or no ranking."""
-ScoreKind = Literal["learned", "gradients", "search", "none"]
+ScoreKind = Literal["learned", "gradient", "search", "none"]
 """Source of a method's confidences: a trained output of the network; gradient similarity of render and image; a global
 search, which fails below its own threshold; none."""
 

@@ -27,7 +27,7 @@ from posecore.mesh import Mesh
 from posecore.raster import Instance, Rasteriser
 from posecore.simplify import simplified
 
-from refinenet.baselines.base import Baseline, failed
+from refinenet.baselines.base import NOT_VISIBLE, Baseline, failed
 from refinenet.baselines.edge_icp import refine_by_edges
 from refinenet.baselines.patch import ObjectPatch, TrackedObject, render_and_crop
 from refinenet.baselines.pose_sampling import PoseSampler, prior_distance
@@ -137,7 +137,7 @@ class GradientSearch(Baseline):
         initial = np.ascontiguousarray(T_cam_obj, np.float64)
         patch = render_and_crop(frame.image, frame.K, initial, target, config.patch_px, config.window_scale)
         if patch is None:
-            return failed(T_cam_obj, 0, "the object is not visible in the image at the initial pose")
+            return failed(T_cam_obj, 0, NOT_VISIBLE)
         model, simple = self._model(target), replace(target, rasteriser=self._simplified)
         rng = np.random.default_rng([target.obj_id, zlib.crc32(initial.tobytes())])
         poses = [initial, *search(patch, initial, target.mesh, model, rng, config)]

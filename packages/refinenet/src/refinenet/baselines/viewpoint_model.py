@@ -87,9 +87,8 @@ def make_viewpoint_model(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> Vie
         for T_cam_obj, depth_m, mask, direction, edge in zip(
             batch, layers.depth_m, layers.mask, unit, strength, strict=True
         ):
-            near_m = np.where(
-                mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8))
-            )  # the surface's depth beside the silhouette
+            # beside the silhouette, the depth of the surface next to it
+            near_m = np.where(mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8)))
             pixels = np.argwhere(_ridge(direction, edge) & (near_m > 0))
             if len(pixels) == 0:  # no edge from this viewpoint, as of a sheet from its side: use the centre
                 pixels, near_m = np.full((1, 2), VIEW_PX // 2), np.full_like(near_m, T_cam_obj[2, 3])

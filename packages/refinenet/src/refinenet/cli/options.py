@@ -2,11 +2,13 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import get_args
 
 import click
 from click.core import ParameterSource
 from posecore import command_line
 
+from refinenet.config import DeviceName
 from refinenet.refine.registry import METHODS, NETWORK, MethodSettings
 
 RESULT_FILES = ("--init", "--out", "--candidates")
@@ -21,7 +23,7 @@ checkpoint_option = click.option(
     help="Trained network (.safetensors), for --method network; makes `refine --method search` more accurate.",
 )
 device_option = click.option(
-    "--device", type=click.Choice(["auto", "cpu", "cuda"]), default="auto", help="Device of the network."
+    "--device", type=click.Choice(get_args(DeviceName)), default="auto", help="Device of the network."
 )
 threads_option = click.option(
     "--threads", type=click.IntRange(0), default=0, help="Torch threads; 0 leaves torch's choice."

@@ -101,9 +101,9 @@ def refine(
 ) -> None:
     """Refine BOP estimates; method and settings go into the result file's sidecar.
 
-    A refined pose's score is its similarity to the image, from 0 to 1. Exit code 0 also when some poses fail: these are
-    left out of the file (or kept as they were, --keep-failed), listed on stderr with the reason, and counted on the
-    last line.
+    A refined pose's score is its confidence, from 0 to 1, or the initial pose's score for a method without confidences.
+    Exit code 0 also when some poses fail: these are left out of the file (or kept as they were, --keep-failed), listed
+    on stderr with the reason, and counted on the last line.
 
     \b
     refinenet refine --checkpoint best.safetensors --dataset lmo --init start.csv --out results/refined.csv

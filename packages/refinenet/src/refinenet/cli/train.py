@@ -6,16 +6,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import click
 from posecore.command_line import progress_bar, stoppable
 
 from refinenet.cli.options import FILE, quiet_option, verbose_option
 from refinenet.config import DeviceName, LossName, PresetName
-
-if TYPE_CHECKING:
-    from rich.progress import TaskID
 
 log = logging.getLogger(__name__)
 
@@ -50,7 +47,7 @@ log = logging.getLogger(__name__)
 @click.option("--init", type=FILE, metavar="FILE", help="Checkpoint with the initial weights.")
 @click.option("--out", type=FILE, metavar="DIR", help="Checkpoints and logs. [runs/PRESET]")
 @click.option("--resume", is_flag=True, help="Continue the run in --out.")
-@click.option("--follow", is_flag=True, help="SHARDS is still being rendered: add new shards between epochs.")
+@click.option("--follow", is_flag=True, help="SHARDS is being rendered, or will be: add new shards between epochs.")
 @click.option("--skip-bad-shards", is_flag=True, help="Train without unreadable shards; each is reported.")
 @quiet_option
 @verbose_option
@@ -144,31 +141,27 @@ def _checkpoints(folder: Path, steps: int) -> Iterator[str]:
 @contextmanager
 def _training_bar(steps: int, quiet: bool) -> Iterator[Any]:
     """A progress line with the loss and where a step's time goes, and one line for each validation."""
-    bar = progress_bar(quiet, "{task.fields[state]}")
-    task: TaskID = bar.add_task("steps", total=steps, state="first batches")
+    with progress_bar(quiet, "{task.fields[state]}") as bar:
+        task = bar.add_task("steps", total=steps, state="first batches", visible=False)
 
-    def report(step: int, values: dict[str, float]) -> None:
-        bar.start()  # at the first report: an error in settings or data stays on a line of its own
-        if "validation/add_after_mm" in values:
-            if not quiet:
-                change = "  ".join(
-                    f"{key} {values[f'validation/{key}_before_{unit}']:.2f} -> "
-                    f"{values[f'validation/{key}_after_{unit}']:.2f} {unit}"
-                    for key, unit in (("rotation", "deg"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("add", "mm"))
-                )
-                bar.console.print(f"step {step}  {change}", highlight=False, soft_wrap=True)
-            return
-        loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss"))
-        wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_fraction']:.0f} %)"
-        timing = f"{wait}, compute {values['compute_ms']:.0f} ms, {values['pairs_per_s']:.0f} pairs/s"
-        bad = f"  {values['skipped_shards']:.0f} bad shards" if values["skipped_shards"] else ""
-        bar.update(task, completed=step, state=f"{loss}  {timing}{bad}")
+        def report(step: int, values: dict[str, float]) -> None:
+            if "validation/add_after_mm" in values:
+                bar.update(task, visible=True)
+                if not quiet:
+                    change = "  ".join(
+                        f"{key} {values[f'validation/{key}_before_{unit}']:.2f} -> "
+                        f"{values[f'validation/{key}_after_{unit}']:.2f} {unit}"
+                        for key, unit in (("rotation", "deg"), ("x", "mm"), ("y", "mm"), ("z", "mm"), ("add", "mm"))
+                    )
+                    bar.console.print(f"step {step}  {change}", highlight=False, soft_wrap=True)
+                return
+            loss = next(f"{key} {value:.3f}" for key, value in values.items() if key.startswith("loss"))
+            wait = f"data wait {values['data_wait_ms']:.0f} ms ({100 * values['data_wait_fraction']:.0f} %)"
+            timing = f"{wait}, compute {values['compute_ms']:.0f} ms, {values['pairs_per_s']:.0f} pairs/s"
+            bad = f"  {values['skipped_shards']:.0f} bad shards" if values["skipped_shards"] else ""
+            bar.update(task, completed=step, state=f"{loss}  {timing}{bad}", visible=True)
 
-    try:
         yield report
-    finally:
-        if bar.live.is_started:  # stopping one that never started prints an empty line
-            bar.stop()
 
 
 @contextmanager

@@ -208,7 +208,7 @@ class OnlinePairMaker:
                 hypothesis = draw_hypothesis(around, mesh.diameter_m, self._hypothesis, rng, reach=0.5**attempt)
             else:
                 hypothesis = T_rotation @ sample["T_cam_obj_hypothesis"]
-            if (hypothesis[:3, :3] @ mesh.center_m + hypothesis[:3, 3])[2] < mesh.diameter_m:
+            if mesh.center_cam_m(hypothesis)[2] < mesh.diameter_m:
                 continue
             fixed_px = self._fixed_sides_px.get(int(sample["obj_id"]), stored.side_px)
             window = hypothesis_window(self._window, sample["K"], hypothesis, mesh, fixed_px)

@@ -1,6 +1,7 @@
 """Migration of files that earlier versions wrote: checkpoints, optimiser states, data records and metrics of a run.
 
-Files are migrated when they are read and never rewritten. Tensor names have not changed since the first version.
+Files are migrated when they are read. Only `metrics.jsonl` is rewritten, by a resumed run. Tensor names have not
+changed since the first version.
 """
 
 from collections.abc import Mapping

@@ -254,9 +254,8 @@ class FlowNet(nn.Module):
         """The update of each hypothesis."""
         depth_m, T = inputs.hypothesis_depth_m, inputs.T_cam_obj
         assert depth_m is not None  # filled by every stream for a config with `uses_depth`
-        half_m = (
-            0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]
-        )  # half the window's side at the object's depth
+        # half the window's side at the object's depth
+        half_m = 0.5 * self.patch_px / inputs.K_crop[:, 0, 0] * T[:, 2, 3]
         outputs, pooled = self._flow_features(inputs, depth_m, half_m)
         with torch.autocast(depth_m.device.type, enabled=False):  # poses need every digit
             x = outputs.float().permute(0, 2, 3, 1).flatten(1, 2)

@@ -96,7 +96,7 @@ class Refiner:
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
-        self._sees_depth = loaded.provenance.config.network.uses_depth
+        self._uses_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
         self.patch_renderer = PatchRenderer(meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
@@ -127,7 +127,7 @@ class Refiner:
     @property
     def score_kind(self) -> ScoreKind:
         """Source of the confidences."""
-        return "learned" if self.scorer == "learned" else "gradients"
+        return self.scorer
 
     @property
     def corrects_depth(self) -> bool:
@@ -298,15 +298,15 @@ class Refiner:
 
     def _forward(self, patches: Patches, T: Float[np.ndarray, "s 4 4"], first: int) -> PoseUpdate:
         part = slice(first, first + self._batch)
-        pair = NetworkInput(
+        inputs = NetworkInput(
             scene_rgb=self._tensor(patches.scene_rgb[part].transpose(0, 3, 1, 2)),
             hypothesis_rgb=self._tensor(patches.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
             T_cam_obj=self._tensor(T[part].astype(np.float32)),
             K_crop=self._tensor(patches.K_crop[part].astype(np.float32)),
-            hypothesis_depth_m=self._tensor(patches.depth_m[part]) if self._sees_depth else None,
+            hypothesis_depth_m=self._tensor(patches.depth_m[part]) if self._uses_depth else None,
         )
         with torch.inference_mode():
-            update: PoseUpdate = self._network(pair)
+            update: PoseUpdate = self._network(inputs)
         return update
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:

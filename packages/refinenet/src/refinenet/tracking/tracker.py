@@ -24,7 +24,7 @@ from refinenet.tracking.state import (
 
 DEFAULT_CONFIGS: dict[ScoreKind, TrackingConfig] = {
     "learned": LEARNED_TRACKING,
-    "gradients": GRADIENT_TRACKING,
+    "gradient": GRADIENT_TRACKING,
     "search": SEARCH_TRACKING,
     "none": UNSCORED_TRACKING,
 }

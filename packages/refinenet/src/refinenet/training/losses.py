@@ -17,7 +17,8 @@ from refinenet.models.flow_solver import offsets_to_px, weighted
 MAX_FLOW_COST = 50.0
 """Bound of a surface point's cost in `flow_loss`: a point far off would dominate all others."""
 POSE_QUALITY_SCALE = 0.06
-"""Point error, as a fraction of the bounding-box diagonal, at which the pose quality is 1 / e."""
+"""Point error, as a fraction of the bounding-box diagonal, at which the pose quality is 1 / e: a few pixels of a patch,
+within reach of the flow."""
 
 
 def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b n 2"]) -> Float[Tensor, "b n"]:

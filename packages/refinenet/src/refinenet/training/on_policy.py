@@ -213,7 +213,7 @@ class OnPolicyHypotheses:
     def _window(self, K_patch: Float[np.ndarray, "3 3"], T: Float[np.ndarray, "4 4"], index: int) -> Window | None:
         """Window of a pose in the old patch's pixels; None for a pose too near to render or outside the patch."""
         mesh, patch_px = self._meshes[self._obj_ids[index]], self._config.network.patch_px
-        if not np.isfinite(T).all() or (T[:3, :3] @ mesh.center_m + T[:3, 3])[2] < mesh.diameter_m:
+        if not np.isfinite(T).all() or mesh.center_cam_m(T)[2] < mesh.diameter_m:
             return None
         window = hypothesis_window(self._config.window, K_patch, T, mesh, patch_px)
         shift_px = max(abs(window.x0_px), abs(window.y0_px))

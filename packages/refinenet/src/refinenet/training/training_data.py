@@ -3,7 +3,7 @@
 import hashlib
 import json
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -53,10 +53,7 @@ class TrainingData:
 
     def report_skipped(self, *messages: str) -> None:
         """Log errors of unreadable shards that are new."""
-        for message in messages:
-            if message not in self.skipped:
-                self.skipped.append(message)
-                log.warning("skipped: %s", message)
+        _report_skipped(self.skipped, messages)
 
 
 def open_data(
@@ -92,7 +89,8 @@ def open_data(
         raise ConfigError(f"{url}: there is no object {min(unknown)} in it, only {names}; choose among those")
     if wait:  # each rank polls by itself: a barrier would time out
         wait_for_start(reader, config, ranks.world * max(1, config.loader.workers))
-    training, validation, record, bad = _split(reader, config, out, ranks, resume=resume)
+    skipped: list[str] = []
+    training, validation, record = _split(reader, config, out, ranks, skipped, resume=resume)
     growing = GrowingSplit(out=out, record=record, config=config) if config.loader.follow else None
     meshes = load_meshes(reader)
     data = TrainingData(
@@ -109,30 +107,32 @@ def open_data(
             if not config.objects or int(key) in config.objects
         },
         camera_fx_px=float(reader.card.get("camera", {}).get("fx", 0.0)),
+        skipped=skipped,
     )
-    data.report_skipped(*bad, *(data.validation.skipped if data.validation else ()))
+    data.report_skipped(*(data.validation.skipped if data.validation else ()))
     return data
 
 
 def _split(
-    reader: ShardReader, config: TrainConfig, out: Path, ranks: Ranks, *, resume: bool
-) -> tuple[Split, Split, DataRecord, tuple[str, ...]]:
-    """Training and validation side, record and errors of unreadable shards; rank 0 decides for every rank."""
-    chosen = _chosen_split(reader, config, out, resume=resume) if ranks.rank == 0 else None
+    reader: ShardReader, config: TrainConfig, out: Path, ranks: Ranks, skipped: list[str], *, resume: bool
+) -> tuple[Split, Split, DataRecord]:
+    """Training and validation side, and record; rank 0 decides for every rank, and reports unreadable shards."""
+    chosen = _chosen_split(reader, config, out, skipped, resume=resume) if ranks.rank == 0 else None
     chosen = ranks.from_first(chosen)
     assert chosen is not None
-    record, scene_of, bad = chosen
-    return (*divide(scene_of, record.validation_scenes), record, bad if ranks.rank == 0 else ())
+    record, scene_of = chosen
+    return (*divide(scene_of, record.validation_scenes), record)
 
 
 def _chosen_split(
-    reader: ShardReader, config: TrainConfig, out: Path, *, resume: bool
-) -> tuple[DataRecord, dict[int, Any], tuple[str, ...]]:
-    """Record of the split, which a new run writes, scene of every sample by shard, and errors of unreadable shards."""
+    reader: ShardReader, config: TrainConfig, out: Path, skipped: list[str], *, resume: bool
+) -> tuple[DataRecord, dict[int, Any]]:
+    """Record of the split, which a new run writes, and scene of every sample by shard."""
     loader, validation = config.loader, config.validation
     record = DataRecord.load(out) if resume else None
     shards = record.shards if record is not None else reader.committed
     scene_of, bad = read_scenes(reader, shards, skip=loader.skip_bad_shards, objects=config.objects)
+    _report_skipped(skipped, bad.values())  # at once: they may be the reason why no split is possible
     if not (loader.follow or reader.complete):
         log.warning(
             "%s: %d of %d shards are there, and only these are trained on; --follow takes those that come",
@@ -144,7 +144,14 @@ def _chosen_split(
         )
         record = DataRecord(shards=tuple(scene_of), validation_scenes=tuple(int(scene) for scene in scenes))
         record.save(out)
-    return record, scene_of, tuple(bad.values())
+    return record, scene_of
+
+
+def _report_skipped(skipped: list[str], messages: Iterable[str]) -> None:
+    for message in messages:
+        if message not in skipped:
+            skipped.append(message)
+            log.warning("skipped: %s", message)
 
 
 def _dataset_sha256(reader: ShardReader, config: TrainConfig) -> str:
