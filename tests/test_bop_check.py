@@ -22,6 +22,7 @@ def render(out: Path, objects: Path, *arguments: str) -> Path:
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "arguments",
     [

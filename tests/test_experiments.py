@@ -147,6 +147,7 @@ def test_a_wrong_line_is_found(tmp_path) -> None:
         check_line(["synthgen", "cut", "a", "--out", "b", "--set", "no_such=1"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_help_and_list_run_nothing(name, inputs, tmp_path) -> None:
     script = [sys.executable, str(ROOT / "experiments" / f"{name}.py")]

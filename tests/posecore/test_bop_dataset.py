@@ -107,6 +107,7 @@ def test_scene_gt_info_follows_bop(dataset_path):
     assert [int((cv2.imread(str(path), -1) == 255).sum()) for path in masks] == [80, 40]
 
 
+@pytest.mark.slow
 def test_boxes_match_real_annotations(shared_data):
     """px counts and boxes of LM-O's own scene_gt_info come out of silhouettes rendered at its ground truth."""
     raster = pytest.importorskip("posecore.raster")

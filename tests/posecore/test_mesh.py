@@ -84,6 +84,7 @@ def test_diameter_of_many_points_is_still_exact() -> None:
         assert diameter(points) == pytest.approx(brute, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_normals_have_length_1_whatever_the_file_holds(shared_data: Path) -> None:
     cup = load_mesh(shared_data / "meshes/cup/cup.ply")  # its normals are 6.3 long
     np.testing.assert_allclose(np.linalg.norm(cup.normals, axis=1), 1, atol=1e-6)

@@ -74,6 +74,7 @@ def test_its_settings_are_shown_under_their_new_names(earlier):
         assert "share" not in info_text(info)
 
 
+@pytest.mark.slow
 def test_a_complete_one_is_left_byte_for_byte_and_a_missing_shard_is_rendered(earlier):
     folder, before = earlier / "pairs", files(earlier / "pairs")
     render_dataset(pairs_job(folder))
@@ -93,6 +94,7 @@ def test_other_settings_are_refused_under_the_new_name(earlier):
         render_dataset(pairs_job(earlier / "pairs", "tabletop.near_fraction=0.3"))
 
 
+@pytest.mark.slow
 def test_it_is_merged_with_a_new_one_and_the_merge_is_continued(earlier, tmp_path):
     render_dataset(pairs_job(tmp_path / "new", seed=4))
     urls, out = [str(earlier / "pairs"), str(tmp_path / "new")], tmp_path / "merged"

@@ -96,6 +96,7 @@ def test_one_sensor_of_several_is_checked(root):
     assert "several sensors (cam1 in 2 scene(s), cam2 in 1 scene(s))" in line
 
 
+@pytest.mark.slow
 def test_real_data_has_only_what_is_truly_wrong_in_it(shared_data):
     """LM-O's own rotations are up to 0.01 off, and only one of the 48 frames has its depth here."""
     findings = check(shared_data / "lmo", [shared_data / "lmo/init_ssd6d-like_lmo-test.csv"], samples=5)

@@ -449,6 +449,7 @@ def checked(root, results=()):
     return findings
 
 
+@pytest.mark.slow
 @settings(fuzz, max_examples=100)
 @given(name=st.sampled_from(FILES), change=damage())
 def test_check_survives_any_file(root, name, change):
@@ -458,6 +459,7 @@ def test_check_survives_any_file(root, name, change):
             use(root)
 
 
+@pytest.mark.slow
 @settings(fuzz, max_examples=100)
 @given(name=st.sampled_from(JSON_FILES), which=st.integers(0, 10_000), new=strange, rename=st.booleans())
 def test_check_survives_anything_in_json(root, name, which, new, rename):
@@ -468,6 +470,7 @@ def test_check_survives_anything_in_json(root, name, which, new, rename):
             use(root)
 
 
+@pytest.mark.slow
 @settings(fuzz, max_examples=60)
 @given(change=damage(longest=8))
 def test_check_survives_any_result_file(root, tmp_path, sound, change):
@@ -497,6 +500,7 @@ def test_report_survives_any_file_of_the_dataset(root, sound, tmp_path, name, ch
         reported(root, sound.parent / "poses_cubes-test.csv", tmp_path / "report")
 
 
+@pytest.mark.slow
 @few
 @given(name=st.sampled_from(JSON_FILES), which=st.integers(0, 10_000), new=strange, rename=st.booleans())
 def test_report_survives_anything_in_json(root, sound, tmp_path, name, which, new, rename):

@@ -44,6 +44,7 @@ def work(tmp_path, monkeypatch, dataset_path):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_report_without_arguments(work):
     result = run("report")
     assert result.exit_code == 0, result.output
@@ -58,6 +59,7 @@ def test_report_without_arguments(work):
     assert "z error down to 0.25 of the initial one" in against["words"]
 
 
+@pytest.mark.slow
 def test_the_page_stands_alone_and_says_what_it_measured(work):
     assert run("report", "--worst", 3).exit_code == 0
     page = (work / "report/index.html").read_text()
@@ -84,6 +86,7 @@ def test_the_table_has_a_line_for_each_pose(work):
     assert all(float(row["add_m"]) >= 0 for row in rows if row["found"] == "1")
 
 
+@pytest.mark.slow
 def test_reports_are_reproducible(work):
     assert run("report", "--out", "a").exit_code == 0
     assert run("report", "--out", "b").exit_code == 0
@@ -128,6 +131,7 @@ def test_perturbation_depends_on_the_seed_only(work):
     assert (work / "a.csv").read_bytes() != (work / "c.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_curves_by_level(work):
     """The refined file says nothing of levels: it takes them from the starts, line by line."""
     options = ("--angles", "10,40,45,60", "--translations", "0.1,0.5,0.8")
@@ -214,6 +218,7 @@ def test_help_has_examples(command):
     assert "Examples:" in result.output
 
 
+@pytest.mark.slow
 def test_real_start_poses(shared_data, tmp_path):
     """The 349 start poses of LM-O: numbers of bop_toolkit's cus and of the noise that was put in."""
     folder = shared_data / "lmo"

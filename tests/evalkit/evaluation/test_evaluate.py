@@ -51,6 +51,7 @@ def test_truth_scores_perfectly(dataset, perfect, kind):
     assert (total["5cm5deg"], total["proj_5px"], total["diverged"], total["missing"]) == (1.0, 1.0, 0.0, 0)
 
 
+@pytest.mark.slow
 def test_values_do_not_depend_on_workers_or_blocks(dataset, perfect, monkeypatch):
     rng = np.random.default_rng(1)
     moved = [replace(e, T_cam_obj=se3.perturb(e.T_cam_obj, 0.2, 0.02, rng)) for e in perfect for _ in range(7)]
@@ -72,6 +73,7 @@ def test_values_do_not_depend_on_workers_or_blocks(dataset, perfect, monkeypatch
     assert len(none) == 0
 
 
+@pytest.mark.slow
 def test_a_fault_in_a_worker_is_the_error_of_one_process(dataset_path, tmp_path, perfect):
     root = tmp_path / "toys"
     shutil.copytree(dataset_path, root)

@@ -233,6 +233,7 @@ def test_vsd_of_a_plate_in_depth(plates):
         assert rows.loc[1, name] == pytest.approx(expected, abs=1e-12), name
 
 
+@pytest.mark.slow
 def test_truth_under_any_of_its_symmetries_scores_perfectly(tmp_path, tug_ply, bobbin_ply):
     """Every sampled turn of the continuous one, and a discrete one: errors that know of symmetries are 0, recalls 1."""
     dataset = BopDataset(write_dataset(tmp_path / "toys", {TUG: load_mesh(tug_ply), BOBBIN: load_mesh(bobbin_ply)}))

@@ -28,6 +28,7 @@ def moved(T, x=0.0, y=0.0, z=0.0):
     return se3.make_T(T[:3, :3], T[:3, 3] + np.array([x, y, z]))
 
 
+@pytest.mark.slow
 def test_every_error_agrees_with_bop_toolkit(shared_data):
     """349 start poses on LM-O; golden values: bop_toolkit cea62d6, vispy renderer, models_eval, symmetry step 0.01."""
     folder = shared_data / "lmo"

@@ -146,6 +146,7 @@ def test_intervals_hold_the_truth_as_often_as_they_promise(scenes, least, statis
     assert least <= held / trials <= 0.985
 
 
+@pytest.mark.slow
 def test_two_hundred_thousand_rows_take_seconds():
     rng = np.random.default_rng(0)
     rows = 200_000

@@ -75,6 +75,7 @@ def test_before_after_and_losses_from_a_working_folder(work):
     assert "### Mean errors and recall" in result.output
 
 
+@pytest.mark.slow
 def test_curves_from_perturbed_starts_and_what_departs_from_the_protocol(work, dataset_path):
     perturb(dataset_path, "curve/start.csv", "--protocol", "paper")
     initial_poses, dataset = read_results("curve/start.csv"), BopDataset(dataset_path)

@@ -74,6 +74,7 @@ def test_small_perturbations_converge(tug_ply, name, least, ratio):
     assert np.median(after) < ratio * np.median(before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "least", "ratio"), [("edge-icp", 0.8, 0.2), ("depth-icp", 0.9, 0.2), ("region", 0.55, 0.4)]
 )
@@ -86,6 +87,7 @@ def test_scanned_objects_converge(shared_data, name, least, ratio):
     assert np.mean(np.concatenate(after) < np.concatenate(before)) >= 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["edge-icp", "region"])
 def test_the_truth_stays_where_it_is(shared_data, name):
     """Pixels that hold both sides of the silhouette's edge count as beside it, which costs region some depth."""
@@ -110,6 +112,7 @@ def test_a_pose_far_from_its_start_has_diverged(tug):
     assert refined(start, near, near, 9, tug.diameter_m).status is Status.CONVERGED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["edge-icp", "depth-icp"])
 def test_a_symmetric_object_converges_to_one_of_its_poses(bobbin_ply, name):
     _, before, after = shares(name, bobbin_ply, symmetric=True)

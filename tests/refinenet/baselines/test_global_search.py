@@ -51,6 +51,7 @@ def errors(name, ply, seeds):
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_far_starts_come_back(shared_data):
     """Of 12 frames (seeds 0 to 5) all did when this was written, and 5 with edge ICP alone."""
     plys = [shared_data / f"lmo/models/obj_{obj_id:06d}.ply" for obj_id in LMO_OBJECTS]
@@ -61,6 +62,7 @@ def test_far_starts_come_back(shared_data):
     assert (by_edges[:, 1] < 0.1).sum() <= 3
 
 
+@pytest.mark.slow
 def test_where_the_object_is_not_it_fails(tug, seen):
     """Clutter has edges that some pose runs along, which is not enough; the start is kept."""
     frame, truth, _, _ = seen
@@ -100,6 +102,7 @@ class Given:
         self.closed = True
 
 
+@pytest.mark.slow
 def test_what_a_network_finds_is_taken_where_it_agrees_better(tug, seen, monkeypatch):
     """Without edge ICP, which finds the truth here itself. One that errs or fails is not believed."""
     monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
@@ -145,6 +148,7 @@ class Mover(Given):
     predicts_pose_quality = True
 
 
+@pytest.mark.slow
 def test_predicted_pose_quality_counts_in_the_choice(tug, seen, monkeypatch):
     monkeypatch.setattr(search_module, "refine_by_edges", lambda image, K, pose, *rest: failed(pose, 1, "off"))
     frame, truth, _, _ = seen
@@ -178,6 +182,7 @@ def test_predicted_pose_quality_counts_in_the_choice(tug, seen, monkeypatch):
     assert re.search(r"its combined score is 0\.\d{3} at most, below the minimum of 0\.5", nowhere.failure)
 
 
+@pytest.mark.slow
 def test_search_with_a_network_from_the_command_line(cli, tug, tug_ply, seen, repository, tmp_path):
     frame, truth, _, _ = seen
     camera = Camera(K=K, width_px=frame.image.shape[1], height_px=frame.image.shape[0])
@@ -230,6 +235,7 @@ def seen(tug):
         yield frame, truth, view, make_viewpoint_model(1, tug, rasteriser)
 
 
+@pytest.mark.slow
 def test_what_is_found_alone_does_not_depend_on_other_poses(tug, seen):
     frame, truth, _, _ = seen
     requests = [Request(obj_id=1, T_cam_obj=far_start(truth, seed)) for seed in (0, 1)]
@@ -290,6 +296,7 @@ def test_what_lies_outside_of_the_patch_counts_against_a_pose_and_of_the_image_o
     assert model.similarity(truth[None], view.K, np.minimum(half[:, ::-1], half), ones)[0] == 0
 
 
+@pytest.mark.slow
 def test_a_sheet_seen_from_its_side_has_points_near_itself(tug):
     sheet = replace(tug, vertices_m=tug.vertices_m * np.array([1.0, 1.0, 0.0]))
     with Rasteriser({1: sheet}) as rasteriser:

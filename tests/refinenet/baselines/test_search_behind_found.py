@@ -37,6 +37,7 @@ def covered(tug, mesh):
     return mesh, frames
 
 
+@pytest.mark.slow
 def test_what_is_known_to_be_in_front_does_not_count(tug, covered):
     _, frames = covered
     with Rasteriser({1: tug}) as rasteriser:
@@ -82,6 +83,7 @@ class Knowing(Given):
         ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
     thing, frames = covered
     for frame, truth, front, _ in frames:
@@ -105,6 +107,7 @@ def test_what_fails_alone_is_found_behind_what_was_found(tug, covered):
         assert unjudged.failed
 
 
+@pytest.mark.slow
 def test_what_stays_failed_says_how_far_it_came(tug, covered):
     """Beside the other object, which is found, there is nothing but noise."""
     thing, ((frame, truth, front, known_m), *_) = covered
@@ -154,6 +157,7 @@ def test_poses_are_found_one_behind_the_other(tug, monkeypatch):
     assert [result.iterations for result in results] == [1, 2, 3, 4]
 
 
+@pytest.mark.slow
 def test_a_pose_of_the_same_object_from_another_start_hides_nothing(tug, covered):
     thing, ((frame, truth, _, _), *_) = covered
     nearer, aside = truth.copy(), truth.copy()

@@ -24,6 +24,7 @@ def test_every_command_shows_an_example(cli):
         assert f"refinenet {command} " in cli(command, "--help").output
 
 
+@pytest.mark.slow
 def test_train_command(cli, dataset, tmp_path):
     out = tmp_path / "run"
     result = cli("train", dataset, "--out", out, *SMALL)
@@ -99,6 +100,7 @@ def test_a_folder_that_is_no_dataset_is_one_line(cli, tmp_path):
     assert "no shard dataset" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_damaged_shard_is_one_line_also_from_a_loader_process(cli, dataset, tmp_path, workers):
     copy = shutil.copytree(dataset, tmp_path / "shards")
@@ -113,6 +115,7 @@ def test_a_damaged_shard_is_one_line_also_from_a_loader_process(cli, dataset, tm
     assert line.startswith(f"Error: {file}: found ")
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_for_tensorboard_is_one_line(cli, dataset, tmp_path, monkeypatch):
     """Its events are written by a thread, whose traceback Python would print."""
 

@@ -163,7 +163,11 @@ def test_refine_errors_are_one_line(cli, bop, trained, tmp_path):
         (["--checkpoint", trained, *rest, "--object", "5"], 2, "no pose of object 5"),
         (["--checkpoint", trained, *rest, "--hypotheses", 4, "--scorer", "learned"], 1, "no confidence output"),
         (["--checkpoint", trained, "--dataset", tmp_path / "no", *rest[2:]], 1, "no such folder"),
-        (["--checkpoint", trained, *rest, "--scorer", "none"], 2, "--scorer has no effect with one hypothesis, see --h"),
+        (
+            ["--checkpoint", trained, *rest, "--scorer", "none"],
+            2,
+            "--scorer has no effect with one hypothesis, see --h",
+        ),
         (["--checkpoint", trained, *rest, "--seed", 1], 2, "--seed has no effect with one hypothesis"),
         (["--method", "region", *rest, "--batch", 8], 2, "--batch has no effect for --method region without a network"),
         (["--method", "search", *rest, "--seed", 8], 2, "--seed has no effect for --method search; leave it out"),

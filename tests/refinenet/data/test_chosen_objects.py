@@ -56,6 +56,7 @@ def test_only_the_chosen_objects_scenes_are_split(two_objects):
     assert (training.n, validation.n) == (18, 6)
 
 
+@pytest.mark.slow
 def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     config = small("objects=[2]", "batch=4", "steps=3", "loader.workers=0")
     run = open_run(config, str(two_objects), tmp_path / "look")

@@ -105,6 +105,7 @@ def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path
     assert set(ids[:, 0].tolist()) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, monkeypatch, caplog):
     url, reveal = growing
     reveal(0)

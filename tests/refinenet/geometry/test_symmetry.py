@@ -50,6 +50,7 @@ def turns(info, rng):
 MODELS = {"axis": model(LINE), "axis and flip": model(LINE, discrete=(FLIP,)), "ball": model(*BALL)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_a_pose_that_looks_exact_is_exact(mesh, name):
     rng = np.random.default_rng(3)
@@ -68,6 +69,7 @@ def test_a_pose_that_looks_exact_is_exact(mesh, name):
     assert other["add_mm"].median() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_no_finely_sampled_twin_is_nearer(mesh, name):
     rng = np.random.default_rng(4)

@@ -7,7 +7,7 @@ from posecore import se3
 from posecore.camera import crop_K
 from posecore.raster import Rasteriser
 from posecore.window import diameter_window
-from refinenet.image.edge_gradients import gradients
+from refinenet.image.edge_gradients import orientation_gradients
 from refinenet.models.correlation import GradientCorrelation, directions, orientations
 
 from ..conftest import K
@@ -15,10 +15,10 @@ from ..conftest import K
 P = 96
 
 
-def test_gradients_are_those_of_the_agreement():
+def test_gradients_are_those_of_the_similarity():
     """Away from weak edges, whose strength fades: twice the angle of the channel that changes most."""
     rgb = np.random.default_rng(0).integers(0, 256, (2, 32, 32, 3)).astype(np.float32)
-    unit, strength = gradients(rgb)
+    unit, strength = orientation_gradients(rgb)
     planes = torch.from_numpy(rgb).permute(0, 3, 1, 2)
     x, y = unit[..., 0], unit[..., 1]
     weight = strength**2 / (strength**2 + 12.0**2)
@@ -26,7 +26,7 @@ def test_gradients_are_those_of_the_agreement():
     cells = twice.reshape(2, 2, 16, 2, 16, 2).mean((3, 5))
     np.testing.assert_allclose(orientations(planes, 12.0), cells, atol=1e-4)
     grey = np.repeat(rgb.mean(-1, keepdims=True), 3, -1)
-    unit, strength = gradients(grey)
+    unit, strength = orientation_gradients(grey)
     cells = (unit * (strength / np.sqrt(strength**2 + 24.0**2))[..., None]).reshape(2, 16, 2, 16, 2, 2).mean((2, 4))
     np.testing.assert_allclose(directions(planes, 24.0), cells.transpose(0, 3, 1, 2), atol=1e-4)
 

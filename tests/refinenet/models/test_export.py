@@ -17,6 +17,7 @@ def loaded(repository):
     return checkpoint.load(repository / "examples" / "checkpoints" / "tug_compact.safetensors")
 
 
+@pytest.mark.slow
 def test_onnx_gives_the_networks_updates_at_any_batch_size(cli, loaded, tmp_path):
     out = tmp_path / "model.onnx"
     result = cli("export", "--checkpoint", loaded.path, "--out", out)
@@ -35,6 +36,7 @@ def test_onnx_gives_the_networks_updates_at_any_batch_size(cli, loaded, tmp_path
     assert (about["patch_px"], about["window"]["kind"]) == (64, "diameter")
 
 
+@pytest.mark.slow
 def test_the_exported_program_gives_the_networks_updates(cli, loaded, tmp_path):
     out = tmp_path / "model.pt2"
     assert cli("export", "--checkpoint", loaded.path, "--out", out).exit_code == 0
@@ -50,6 +52,7 @@ def test_the_exported_program_gives_the_networks_updates(cli, loaded, tmp_path):
     assert json.loads(extra["refinenet"])["step"] == loaded.provenance.step
 
 
+@pytest.mark.slow
 def test_a_file_that_differs_is_not_written(loaded, tmp_path, monkeypatch):
     out = tmp_path / "model.pt2"
     runner = export._program_runner
@@ -64,6 +67,7 @@ def test_a_file_that_differs_is_not_written(loaded, tmp_path, monkeypatch):
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_a_confidence_is_exported_where_there_is_one(tmp_path):
     class Confident(torch.nn.Module):
         def forward(self, pair):

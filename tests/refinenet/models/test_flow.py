@@ -448,6 +448,7 @@ def test_what_the_loss_leaves_out_is_not_measured(dataset):
     assert some["validation/confidence_error"] == every["validation/confidence_error"]
 
 
+@pytest.mark.slow
 def test_onnx_and_program_give_its_updates(run, cli, tmp_path):
     for name in ("model.onnx", "model.pt2"):
         result = cli("export", "--checkpoint", run.path, "--out", tmp_path / name)

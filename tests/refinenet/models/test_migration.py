@@ -76,6 +76,7 @@ def test_the_shipped_checkpoints_load(name, target):
     loaded.network()
 
 
+@pytest.mark.slow
 def test_a_run_of_the_version_before_resumes_as_it_would_have_gone_on(dataset, tmp_path):
     options = ["optimiser.ema_decay=0.9", "optimiser.schedule=constant", "checkpoint_every=3", "log_every=1"]
     train(small(*options, "steps=6"), str(dataset), tmp_path / "whole")

@@ -17,6 +17,7 @@ def columns(path):
     return [line.rsplit(",", 1)[0] for line in path.read_text().splitlines()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", [("--hypotheses", 3), ("--iterations", 2, "--keep-failed")])
 def test_any_number_of_processes_writes_the_same(cli, two_images, trained, tmp_path, what):
     root, start, _ = two_images
@@ -35,6 +36,7 @@ def test_any_number_of_processes_writes_the_same(cli, two_images, trained, tmp_p
     assert all(picture.read_bytes() == (tmp_path / "pictures2" / picture.name).read_bytes() for picture in pictures)
 
 
+@pytest.mark.slow
 def test_search_too(cli, two_images, tmp_path):
     root, start, _ = two_images
     rest = ["--method", "search", "--dataset", root, "--init", start, "--iterations", 1, "--quiet"]
@@ -49,6 +51,7 @@ def test_search_too(cli, two_images, tmp_path):
     assert len(columns(paths[0][1])) > 10
 
 
+@pytest.mark.slow
 def test_what_was_finished_before_a_damaged_image_is_kept(cli, two_images, trained, tmp_path):
     root, start, second = two_images
     second.write_bytes(second.read_bytes()[:200])
@@ -94,6 +97,7 @@ def begun(arguments):
     raise AssertionError("no workers")
 
 
+@pytest.mark.slow
 def test_ctrl_c_and_a_worker_that_dies_end_all_with_one_line(two_images, tmp_path):
     root, start, _ = two_images
     rest = ["--method", "search", "--dataset", root, "--init", start, "--quiet", "--workers", 2, "--out"]

@@ -64,6 +64,7 @@ def frames_of(video):
     return count
 
 
+@pytest.mark.slow
 def test_a_folder_and_a_video_give_the_scenes_poses(cli, scene, still, mesh, tmp_path):
     root, truths = scene
     folder = shutil.copytree(root / "test" / "000001" / "rgb", tmp_path / "images")
@@ -89,6 +90,7 @@ def test_a_folder_and_a_video_give_the_scenes_poses(cli, scene, still, mesh, tmp
         np.testing.assert_allclose(t_mm, 1e3 * truths[3][:3, 3], rtol=0.035)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["edge-icp", "depth-icp"])
 def test_a_baseline_tracks_without_a_checkpoint(cli, scene, tmp_path, method):
     root, truths = scene
@@ -154,6 +156,7 @@ def test_a_symmetric_object_does_not_spin_when_it_is_found_again(cli, bobbin_ply
     np.testing.assert_allclose(poses[0], offered[0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_shipped_flow_network_follows_a_turning_object(cli, repository, tug_ply, tmp_path):
     """Without the three depths that other networks need: depth neither drifts off nor is each frame done thrice."""
     mesh = load_mesh(tug_ply)

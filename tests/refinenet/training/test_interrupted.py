@@ -51,6 +51,7 @@ def test_the_average_is_saved_and_measured(undisturbed, dataset):
     assert lines[-1]["validation/add_after_mm"] == resumed.validate()["validation/add_after_mm"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", range(5))
 def test_a_disk_full_at_any_write_of_a_checkpoint_keeps_the_one_before(
     undisturbed, dataset, tmp_path, monkeypatch, write
@@ -89,6 +90,7 @@ def test_a_run_is_not_resumed_under_other_circumstances(undisturbed, dataset, tm
     (undisturbed / "data.json").write_text(record)
 
 
+@pytest.mark.slow
 def test_a_cosine_rate_that_jumps_on_resume_is_said(dataset, tmp_path, caplog):
     options = ["steps=4", "optimiser.warmup_steps=0"]
     train(small(*options), str(dataset), tmp_path)

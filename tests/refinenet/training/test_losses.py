@@ -124,6 +124,7 @@ def test_gradient_points_home(turned):
     assert cosine.mean() > 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", OF_POSES)
 def test_descent_on_each_loss_finds_the_pose(mesh, shifted, name):
     """Gradient descent on the update itself, in the parametrisation of the compact network."""

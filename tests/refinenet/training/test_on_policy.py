@@ -137,6 +137,7 @@ def test_each_object_is_seen_through_its_own_window(mesh, batch):
     assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)
 
 
+@pytest.mark.slow
 def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path):
     everything = small(
         "on_policy.fraction=0.5", "on_policy.begin=0.2", "on_policy.full=0.5",
@@ -163,6 +164,7 @@ def test_a_run_with_everything_on_resumes_to_the_same_weights(dataset, tmp_path)
     assert 0 < lines[0]["visible_fraction"] < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "switch",
     [

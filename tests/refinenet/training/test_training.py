@@ -52,12 +52,14 @@ def test_a_run_writes_checkpoints_metrics_and_config(run, dataset):
     assert len(loaded.provenance.dataset_sha256) == 64
 
 
+@pytest.mark.slow
 def test_the_same_seed_trains_the_same_weights(run, dataset, tmp_path):
     train(small(), str(dataset), tmp_path)
     first, again = (load_file(out / "last.safetensors") for out in (run[0], tmp_path))
     assert all(torch.equal(first[name], again[name]) for name in first)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_ends_with_the_same_weights(run, dataset, tmp_path):
     """Stopped right after the checkpoint of step 4, in the middle of an epoch."""
 
@@ -92,6 +94,7 @@ def test_resuming_is_refused_where_it_would_be_another_run(run, dataset, tmp_pat
         checkpoint.load(out / "last.safetensors", "paper")
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_the_weights_of_another(run, dataset, tmp_path):
     first = checkpoint.load(run[0] / "best.safetensors")
     config = small(f"init={first.path}", "optimiser.lr=1e-12", "optimiser.weight_decay=0", "steps=1")
@@ -132,6 +135,7 @@ def test_a_damaged_checkpoint_is_one_clean_error(run, tmp_path):
         checkpoint.load(tmp_path / "other.safetensors")
 
 
+@pytest.mark.slow
 def test_a_batch_can_be_overfitted(dataset, tmp_path):
     """The whole chain learns: one fixed batch, its loss well down, its poses much nearer."""
     overrides = ["steps=200", "optimiser.lr=0.002", "optimiser.warmup_steps=0", "augment.background=0"]

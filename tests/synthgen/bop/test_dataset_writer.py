@@ -158,6 +158,7 @@ def test_a_started_dataset_is_continued_to_the_same_bytes(crowded, tmp_path, con
     assert tree(tmp_path / "b") == tree(crowded)
 
 
+@pytest.mark.slow
 def test_workers_make_the_same_bytes_and_one_that_is_killed_is_replaced(crowded, tmp_path, config_of, meshes):
     killed = []
 
@@ -190,6 +191,7 @@ def test_workers_that_are_interrupted_leave_no_temporary_files(tmp_path, config_
     assert len(BopDataset(tmp_path / "w").im_ids(1)) == 1
 
 
+@pytest.mark.slow
 def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, tug_ply, bobbin_ply, config_of, meshes):
     script = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
@@ -296,6 +298,7 @@ def test_more_objects_than_there_are(tmp_path, config_of, tug):
     assert not (tmp_path / "d").exists()
 
 
+@pytest.mark.slow
 def test_the_pbr_preset_shows_many_objects_on_a_table(tmp_path, meshes):
     config = load_config("pbr", [*SMALL_CAMERA, "engine=raster", "window.min_area_px=5", "tabletop.tables=1"])
     write_dataset(tmp_path / "p", config, meshes, FramePlan(split="train_pbr", frames=2, frames_per_scene=2))
@@ -316,6 +319,7 @@ def test_depth_steps_grow_for_far_scenes(config_of, meshes):
         assert dataset_writer._depth_scale(config, make_targets(meshes, config)) == scale
 
 
+@pytest.mark.slow
 @pytest.mark.blender
 def test_cycles_frames_match_the_rasteriser_and_do_not_depend_on_workers(tmp_path, config_of, meshes):
     config = config_of(*MANY, "engine=cycles", "samples=2", "scene.kind=tabletop", "tabletop.tables=1")

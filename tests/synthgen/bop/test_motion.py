@@ -132,6 +132,7 @@ def test_blur_and_background_follow_the_motion(filmed):
     assert (length[1:] <= config.sequence.shutter[1] * 1.2 * moved + 0.05).all()
 
 
+@pytest.mark.slow
 def test_a_frame_does_not_depend_on_the_one_before(config_of, tug, filmed):
     config, _, views = filmed
     maker = FrameMaker(config, make_targets({1: tug}, config), Assets(), FramePlan(frames=FRAMES, sequences=2))

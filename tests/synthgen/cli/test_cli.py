@@ -91,6 +91,7 @@ def test_a_foreign_folder_is_left_alone(tug_ply, tmp_path, small_set):
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
 
 
+@pytest.mark.slow
 def test_render_and_preview(tug_ply, tmp_path, small_set):
     import cv2
 
@@ -117,6 +118,7 @@ def test_bop_renders_frames(tug_ply, tmp_path, small_set):
     assert (tmp_path / "bop/test_targets_bop19.json").is_file()
 
 
+@pytest.mark.slow
 def test_a_mended_setting_may_use_the_folder_of_a_run_that_never_began(tug_ply, tmp_path, small_set):
     """Settings that cannot be drawn leave no folder, whose data card would refuse the ones that can."""
     out = tmp_path / "out"

@@ -61,6 +61,7 @@ def test_front_shapes_hide_part_of_the_object_but_not_too_much(maker_of):
     assert (visible < 0.95).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_the_visible_fraction_is_reached(maker_of):
     maker = maker_of(
         "occluders.visible_fraction=[0.3, 0.9]",

@@ -37,6 +37,7 @@ def test_changing_the_lights_leaves_the_poses(config_of, tug_target):
     assert a.lights != b.lights
 
 
+@pytest.mark.slow
 def test_true_poses_keep_distance_and_place(config_of, tug_target):
     config = config_of("view.position_jitter=0.5")
     camera = config.camera.camera()
@@ -130,6 +131,7 @@ def test_an_object_that_is_rejected_is_drawn_again(config_of, tug_target):
         assert len(ids) == 1
 
 
+@pytest.mark.slow
 def test_materials_have_their_fractions(config_of, tug_target):
     config = config_of(
         "material.textureless_fraction=0.3", "material.random_colour_fraction=0.4", "material.hue_shift=0"
@@ -147,6 +149,7 @@ def test_materials_have_their_fractions(config_of, tug_target):
     assert all(m.hue_shift == 0 and m.saturation == 1 and m.value == 1 for m in materials if m.base_rgb is not None)
 
 
+@pytest.mark.slow
 def test_panoramas_light_and_show_in_their_fractions_and_stand_upright(config_of, tug_target):
     config = config_of("lights.hdri_fraction=0.6", "background.hdri_fraction=0.5", "view.viewpoint=upright")
     assets = Assets(hdris=("a.hdr", "b.hdr"))

@@ -88,6 +88,7 @@ def test_upright_objects_stand(config_of, target):
         np.testing.assert_allclose(T_table_obj[:3, 2], [0, 0, 1], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_mixed_scenes_have_their_fraction_and_keep_their_kind_when_drawn_again(config_of, target):
     config = config_of(
         *TABLETOP,
@@ -148,6 +149,7 @@ def test_tables_are_cut_from_photographs_where_there_are_some(tmp_path):
     assert len({mesh.texture_rgb.tobytes() for mesh in drawn.values()}) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elevation", [20, 70])
 def test_labels_of_the_table_are_those_of_its_plane(tug, config_of, elevation):
     """Also where the table goes on behind the camera: the near plane cuts it, and nothing else does."""

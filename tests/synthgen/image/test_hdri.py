@@ -200,6 +200,7 @@ def test_light_and_background_agree_in_the_raster_engine(tmp_path):
     engine.close()
 
 
+@pytest.mark.slow
 @pytest.mark.blender
 def test_light_and_background_agree_in_cycles(tmp_path):
     import bpy

@@ -89,6 +89,7 @@ def test_a_missing_texture_falls_back_only_when_told_to(tmp_path):
     assert allowed.assets().occluders[0].texture_rgb is None
 
 
+@pytest.mark.slow
 def test_options_reach_the_dataset(tug_ply, bobbin_ply, tmp_path, small_set, caplog):
     import cv2
     from posecore.shard import ShardReader

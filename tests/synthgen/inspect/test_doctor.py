@@ -22,6 +22,7 @@ def no_blender(monkeypatch):
     monkeypatch.setattr(doctor, "_BPY", MISSING_LIBRARY)
 
 
+@pytest.mark.slow
 def test_a_missing_library_is_named_with_its_package(no_blender, tmp_path):
     checks, engines = doctor.check_machine(tmp_path, [])
     bpy = by_name(checks)["bpy"]
@@ -31,6 +32,7 @@ def test_a_missing_library_is_named_with_its_package(no_blender, tmp_path):
     assert by_name(doctor.check_machine(tmp_path, ["cycles"])[0])["bpy"].state == "missing"
 
 
+@pytest.mark.slow
 def test_a_module_that_crashes_or_is_absent_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(doctor, "_BPY", "import os; os.abort()")
     assert by_name(doctor.check_machine(tmp_path, [])[0])["bpy"].text == "crashes (SIGABRT)"

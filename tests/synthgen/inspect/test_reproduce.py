@@ -66,6 +66,7 @@ def test_it_says_which_fields_differ_and_by_how_much(dataset_and_job, only, tmp_
     assert "identical" in only(url, 3).stdout
 
 
+@pytest.mark.slow
 def test_what_is_not_rendered_yet_is_said_and_can_be_saved(only, tmp_path, config_of, tug_ply):
     url, file, picture = tmp_path / "shards", tmp_path / "sample.npz", tmp_path / "sample.png"
     result = only(url, 5)

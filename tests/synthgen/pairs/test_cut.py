@@ -78,6 +78,7 @@ def estimate(scene_id, im_id, obj_id, T):
     return Estimate(scene_id=scene_id, im_id=im_id, obj_id=obj_id, T_cam_obj=T)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("window", ["fixed", "diameter"])
 def test_every_check_of_a_dataset_passes(images, window, tmp_path):
     cut_to(tmp_path / "shards", images, CutConfig(**SMALL, window=window))
@@ -117,6 +118,7 @@ def test_a_fixed_window_is_as_large_as_the_nearest_pose_may_need(images, tmp_pat
         assert 0.8 < side_px / across_px < 1.3
 
 
+@pytest.mark.slow
 def test_the_scene_patch_is_the_image_there(images, tmp_path):
     """Every pixel of a patch is the image's where the window says that its centre lies."""
     planned = cut_to(tmp_path / "shards", images, CutConfig(**{**SMALL, "patch_px": 128}))
@@ -132,6 +134,7 @@ def test_the_scene_patch_is_the_image_there(images, tmp_path):
         assert np.abs(values["scene_rgb"][i].astype(int) - expected).max() <= 8  # of remap's steps of 1/32 pixel
 
 
+@pytest.mark.slow
 def test_labels_are_those_of_the_annotation(images, tmp_path):
     """Model points project into the silhouette, and what others hide is not visible; what others show is in front."""
     planned = cut_to(tmp_path / "shards", images, CutConfig(**SMALL))
@@ -162,6 +165,7 @@ def test_labels_are_those_of_the_annotation(images, tmp_path):
     assert other > 1000
 
 
+@pytest.mark.slow
 def test_without_visible_masks_the_annotated_objects_hide_one_another(tug, config_of, tmp_path):
     """In images in which nothing else could hide them."""
     config = config_of(
@@ -250,6 +254,7 @@ def test_some_images_evenly_spread(images):
     assert len(cut_plan.plan(images, CutConfig(**SMALL, images=5)).images) == 3
 
 
+@pytest.mark.slow
 def test_images_of_one_of_several_scenes_are_one_scene(images, own, tmp_path):
     scene = own.split_path / "000001"
     shutil.copytree(scene, own.split_path / "000007")
@@ -282,6 +287,7 @@ def test_hidden_rims_are_hidden_and_thin_differences_are_not():
     assert not cut._hidden(disc, smaller).any()
 
 
+@pytest.mark.slow
 def test_what_is_visible_beyond_the_mesh_stays_foreground(images, own, tmp_path):
     """The object is a little larger than its mesh: exchanging what is behind must not cut it at the label's edge."""
     for file in own.split_path.rglob("mask_visib/*.png"):
@@ -316,6 +322,7 @@ def test_fixed_windows_need_one_focal_length(own):
     assert cut_card(own, planned, CutConfig(**SMALL))["camera"]["shared"] is False
 
 
+@pytest.mark.slow
 def test_pairs_of_one_image_are_one_scene(images, tmp_path):
     planned = cut_to(tmp_path / "shards", images, CutConfig(**SMALL))
     index = samples(tmp_path / "shards")["scene_index"]
@@ -323,6 +330,7 @@ def test_pairs_of_one_image_are_one_scene(images, tmp_path):
     assert sorted(set(index.tolist())) == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_two_cuts_of_the_same_images_are_merged_into_the_same_scenes(images, tmp_path):
     """With numbers of its own an image could be trained on and held out."""
     for seed in (0, 1):
@@ -342,6 +350,7 @@ def test_two_cuts_of_the_same_images_are_merged_into_the_same_scenes(images, tmp
         open_parts([str(tmp_path / "cut0"), str(tmp_path / "blocks")])
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_ends_with_the_same_bytes(images, tmp_path):
     cut_to(tmp_path / "whole", images, CutConfig(**SMALL))
 
@@ -361,6 +370,7 @@ def test_an_interrupted_run_ends_with_the_same_bytes(images, tmp_path):
         cut_to(tmp_path / "again", images, CutConfig(**SMALL, seed=3))
 
 
+@pytest.mark.slow
 def test_workers_do_not_change_a_byte(images, tmp_path):
     cut_to(tmp_path / "one", images, CutConfig(**SMALL))
     planned = cut_plan.plan(images, CutConfig(**SMALL))

@@ -150,6 +150,7 @@ def test_samples_do_not_depend_on_what_was_rendered_before(maker_of):
         assert np.array_equal(values, b.samples(3)[name]), name
 
 
+@pytest.mark.slow
 def test_silhouettes_are_large_enough(maker_of):
     s = concatenate(maker_of("window.min_area_px=120").samples(i) for i in range(10))
     assert ((s["scene_mask"] & BIT_OBJECT) > 0).sum((1, 2)).min() >= 120
@@ -166,6 +167,7 @@ def test_hypothesis_patches_are_the_object_on_black(maker_of):
     assert np.array_equal(contour, s["hypothesis_distance_px"][0] == 0)
 
 
+@pytest.mark.slow
 def test_a_configuration_that_accepts_nothing_names_the_key_to_change(maker_of, monkeypatch):
     with pytest.raises(ConfigError, match=r"tug\.ply\): all 100 draws .* lower window\.min_area_px \(is 100000\)"):
         maker_of("window.min_area_px=100000").samples(0)

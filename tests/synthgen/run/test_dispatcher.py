@@ -57,12 +57,14 @@ def test_the_dataset_is_complete_and_in_scene_order(reference):
     assert (reference / "models/obj_000001.ply").is_file()
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_same_bytes(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "22", "--workers", "2")
     assert result.returncode == 0, result.stderr
     assert tree(tmp_path / "shards") == tree(reference)
 
 
+@pytest.mark.slow
 def test_a_shorter_dataset_starts_with_the_same_samples(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "3", "--workers", "1")
     assert result.returncode == 0, result.stderr
@@ -113,6 +115,7 @@ def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set)
     assert tree(out) == tree(reference)
 
 
+@pytest.mark.slow
 def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set):
     arguments = command(tug_ply, tmp_path / "shards", small_set, "--n", "4000", "--workers", "1")
     process = subprocess.Popen(
@@ -133,6 +136,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set):
     assert "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, small_set):
     before = tree(reference)
     for extra, named in (

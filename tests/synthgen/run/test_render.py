@@ -19,6 +19,7 @@ def sources(tug_ply):
     return Sources(objects=(tug_ply,))
 
 
+@pytest.mark.slow
 def test_a_job_renders_a_dataset_and_its_second_run_has_nothing_left(sources, config_of, tmp_path):
     job = RenderJob(out=str(tmp_path / "shards"), n=6, config=config_of(), sources=sources, workers=1)
     plans, pairs = [], []
@@ -32,6 +33,7 @@ def test_a_job_renders_a_dataset_and_its_second_run_has_nothing_left(sources, co
     assert (plans[1].present, len(pairs)) == (6, 2)
 
 
+@pytest.mark.slow
 def test_a_damaged_shard_is_in_the_plan(sources, config_of, tmp_path):
     job = RenderJob(out=str(tmp_path / "shards"), n=6, config=config_of(), sources=sources, workers=1)
     render_dataset(job)
