@@ -142,6 +142,7 @@ def site(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_elsewhere(site):
     loading = re.compile(
         r"""<(?:script|img|iframe|source|video)[^>]*\ssrc=["']?(?:https?:)?//|url\(["']?(?:https?:)?//"""
@@ -155,6 +156,7 @@ def test_pages_load_nothing_from_elsewhere(site):
         assert not linked.search(text), page
 
 
+@pytest.mark.slow
 def test_search_works_from_disk(site):
     """Browsers fetch no JSON and start no worker from disk: the index is a script, workers run in frames."""
     assert "perturbation" in (site / "search" / "search_index.js").read_text(encoding="utf-8")

@@ -248,6 +248,7 @@ def test_parts_join_into_one_result_file(tmp_path) -> None:
     assert sidecar["parts"] == {"a_1.csv": "x", "a_2.csv": None}
 
 
+@pytest.mark.slow
 def test_a_category_has_one_diameter_and_an_unseen_member(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["cups.py", str(tmp_path), "--count", "4"])
     assert cups.main() == 0

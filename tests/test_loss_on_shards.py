@@ -13,6 +13,8 @@ from refinenet.geometry.poses import PoseUpdate
 from refinenet.training import losses
 from synthgen.cli import main
 
+pytestmark = pytest.mark.slow
+
 N = 200
 
 

@@ -9,6 +9,8 @@ from posecore.shard import ShardReader
 from refinenet.cli import main as refinenet
 from synthgen.cli import main as synthgen
 
+pytestmark = pytest.mark.slow
+
 CAMERA = "width_px: 160, height_px: 120, fx: 143, fy: 143, cx: 81.5, cy: 60.5"
 RASTER = f"camera: {{{CAMERA}}}\nengine: raster\ncontour_points: 48\npatch_px: 64\nshard_size: 8\n"
 

@@ -93,6 +93,7 @@ def test_posecore_stands_on_its_own() -> None:
     assert users == []
 
 
+@pytest.mark.slow
 def test_blender_stays_in_one_folder() -> None:
     found = offences("synthgen", {"bpy", "mathutils"}, outside="synthgen/engines/blender")
     found += [line for package in PACKAGES if package != "synthgen" for line in offences(package, {"bpy", "mathutils"})]
@@ -120,6 +121,7 @@ def normal(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", PACKAGES)
 def test_no_print_in_packages(package: str) -> None:
     found = []

@@ -139,6 +139,7 @@ def test_any_bytes_are_read_or_refused_cleanly(tmp_path, data):
 number = st.one_of(st.floats(allow_nan=True), st.integers(-5, 5000), st.sampled_from(["", "x", "1e999", "0x1", "½"]))
 
 
+@pytest.mark.slow
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=200)
 @given(
     st.lists(number, min_size=3, max_size=3),

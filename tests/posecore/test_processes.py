@@ -66,6 +66,7 @@ def doubled_later(seconds):
     return 2 * seconds
 
 
+@pytest.mark.slow
 def test_results_come_as_they_finish_each_with_its_task():
     with spawned(2, behave_as_worker, (), "died") as pool:
         assert list(unordered(pool, abs, [], ahead=3)) == []
@@ -90,6 +91,7 @@ def touch_then_die(path):
     return path.name
 
 
+@pytest.mark.slow
 def test_processes_that_die_are_replaced_and_their_items_done_again(tmp_path):
     crashes = []
     items = [tmp_path / name for name in ("a", "once", "b", "c")]
@@ -121,6 +123,7 @@ def test_processes_that_die_at_their_start_are_counted_too(monkeypatch, attempts
     assert crashes == [1]
 
 
+@pytest.mark.slow
 def test_items_that_kill_every_process_end_the_run(tmp_path):
     crashes = []
     results = map_unordered(

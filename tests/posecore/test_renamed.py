@@ -55,6 +55,7 @@ print(*sorted({old.partition(".")[0] for old in table}))
 """
 
 
+@pytest.mark.slow
 def test_every_module_that_is_refused_has_a_new_name_that_exists():
     ended = subprocess.run([sys.executable, "-c", REFUSALS], capture_output=True, text=True)
     assert ended.stdout == "evalkit posecore refinenet synthgen\n", ended.stderr

@@ -223,7 +223,7 @@ def test_another_schema_version_is_refused(tmp_path: Path) -> None:
 
 
 def test_no_dataset_and_broken_manifest(tmp_path: Path) -> None:
-    with pytest.raises(ShardError, match="no shard dataset"):
+    with pytest.raises(ShardError, match="not a shard dataset"):
         shard.ShardReader(str(tmp_path))
     write(str(tmp_path / "d"))
     with (tmp_path / "d/manifest.jsonl").open("a") as stream:

@@ -48,6 +48,7 @@ def arrays(count: int, seed: int) -> dict[str, np.ndarray]:
     return {f.name: rng.integers(0, 2, (count, *f.size(8, 3))) for f in shard.field_table()}
 
 
+@pytest.mark.slow
 def test_a_dataset_on_s3_is_resumed_and_read(bucket: str, tmp_path: Path) -> None:
     first = shard.ShardWriter.create(bucket, CARD)
     first.commit(first.encode(1, arrays(2, 1)))

@@ -89,6 +89,7 @@ def test_a_complete_one_is_left_byte_for_byte_and_a_missing_shard_is_rendered(ea
     assert files(folder)[Path(GROUP)] == before[Path(GROUP)]
 
 
+@pytest.mark.slow
 def test_other_settings_are_refused_under_the_new_name(earlier):
     with pytest.raises(ShardError, match=r"config.tabletop.near_fraction is 0.1 there and 0.3 here"):
         render_dataset(pairs_job(earlier / "pairs", "tabletop.near_fraction=0.3"))

@@ -377,6 +377,7 @@ DATASET_FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DATASET_FAULTS)
 def test_each_fault_of_a_dataset_is_found_at_its_place(root, name):
     damage, level, kind, message = DATASET_FAULTS[name]

@@ -216,6 +216,7 @@ def use_or_refuse(action, *arguments):
         return None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", JSON_FILES)
 @settings(fuzz, max_examples=60)
 @given(which=st.integers(0, 10_000), new=strange, rename=st.booleans())
@@ -225,6 +226,7 @@ def test_json_with_anything_anywhere(root, name, which, new, rename):
         use_or_refuse(use, root)
 
 
+@pytest.mark.slow
 @fuzz
 @given(name=st.sampled_from(JSON_FILES), change=damage())
 def test_json_with_any_bytes(root, name, change):
@@ -291,6 +293,7 @@ token = st.sampled_from(
 ) | st.floats().map(repr)
 
 
+@pytest.mark.slow
 @fuzz
 @given(fields=st.lists(st.lists(token, max_size=10), min_size=6, max_size=8), at=st.integers(0, 2))
 def test_result_lines_of_any_tokens(monkeypatch, fields, at):
@@ -493,6 +496,7 @@ def reported(root, results, out):
         json.loads((out / "summary.json").read_text(), parse_constant=pytest.fail)
 
 
+@pytest.mark.slow
 @few
 @given(name=st.sampled_from(FILES), change=damage())
 def test_report_survives_any_file_of_the_dataset(root, sound, tmp_path, name, change):

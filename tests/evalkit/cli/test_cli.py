@@ -76,6 +76,7 @@ def test_the_page_stands_alone_and_says_what_it_measured(work):
     assert summary["versions"]["evalkit"] in page
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_each_pose(work):
     assert run("report").exit_code == 0
     with (work / "report/estimates.csv").open() as stream:
@@ -94,6 +95,7 @@ def test_reports_are_reproducible(work):
         assert (work / "a" / name).read_bytes() == (work / "b" / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_visible_vss_is_said(work):
     assert run("report", "--vss", "visible").exit_code == 0
     summary = json.loads((work / "report/summary.json").read_text())
@@ -101,6 +103,7 @@ def test_visible_vss_is_said(work):
     assert "tau infinite" in (work / "report/index.html").read_text()
 
 
+@pytest.mark.slow
 def test_files_named_alike_stay_apart(work):
     shutil.copy("results/start.csv", "start.csv")
     result = run("report", "--dataset", "test_bop", "--results", "start.csv", "--results", "results/start.csv")
@@ -204,6 +207,7 @@ def test_broken_inputs_are_one_line(work):
     assert "no scene_gt.json" in run("report").stderr
 
 
+@pytest.mark.slow
 def test_report_into_a_place_that_is_a_file(work):
     (work / "report").write_text("here")
     result = run("report")
@@ -251,6 +255,7 @@ def test_starts_are_not_written_over_a_folder(work):
     assert "is a directory" in result.stderr
 
 
+@pytest.mark.slow
 def test_a_report_says_which_run_was_stopped_and_what_it_leaves_out(work, caplog):
     """Poses that were never tried are missing like those that failed; and a tracked video belongs to no dataset."""
     dataset = BopDataset("test_bop")

@@ -56,6 +56,7 @@ def test_every_error_agrees_with_bop_toolkit(shared_data):
     assert abs(ours.mean() - theirs.mean()) < 0.0005
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_truth_against_itself_is_zero(seed):
     T = pose(seed)
@@ -136,6 +137,7 @@ def plain_errors(T_est, T_gt, points_m, symmetries):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_batches_and_single_poses_follow_the_definitions(symmetric):
     axis = (ContinuousSymmetry((0.0, 1.0, 0.0), (0.01, 0.0, 0.0)),) if symmetric else ()

@@ -11,7 +11,10 @@ from posecore.bop import BopDataset, read_results, write_results
 
 from .browser import Browser, find_chromium
 
-pytestmark = pytest.mark.skipif(find_chromium() is None, reason="no Chromium on the PATH (Debian: chromium)")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_chromium() is None, reason="no Chromium on the PATH (Debian: chromium)"),
+]
 BODY = "tbody:not(.total) tr"
 TABLE = f"[...document.querySelectorAll('table.sortable')].find(t => t.querySelectorAll('{BODY}').length > 2)"
 NUMBER = "cell => parseFloat((cell.dataset.value ?? cell.textContent).replace('\u2212', '-'))"

@@ -2,10 +2,12 @@
 
 import json
 
+import pytest
 from evalkit import ReportJob, make_report
 from posecore.bop import write_results
 
 
+@pytest.mark.slow
 def test_a_report_is_made_from_python(dataset, perfect, tmp_path):
     write_results(tmp_path / "initial.csv", perfect, {"dataset": str(dataset.root), "method": "initial"})
     write_results(tmp_path / "refined.csv", perfect, {"dataset": str(dataset.root), "method": "ours"})

@@ -130,6 +130,7 @@ def test_the_percentiles_are_those_of_a_t_interval():
     assert outer_percentiles(10**6)[0] == pytest.approx(0.025, abs=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scenes", "least"), [(40, 0.92), (6, 0.88)])
 @pytest.mark.parametrize("statistic", ["mean", "median"])
 def test_intervals_hold_the_truth_as_often_as_they_promise(scenes, least, statistic):

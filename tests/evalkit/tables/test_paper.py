@@ -49,6 +49,7 @@ def by_name(path):
     return {table["name"]: table for table in json.loads(path.read_text())}
 
 
+@pytest.mark.slow
 def test_before_after_and_losses_from_a_working_folder(work):
     result = run("--out", "tables.json", "--out", "tables.tex", "--by", "scene")
     assert result.exit_code == 0, result.output
@@ -102,6 +103,7 @@ def test_curves_from_perturbed_starts_and_what_departs_from_the_protocol(work, d
     assert "refinenet: refined in 5 iterations, while protocol 'paper' asks for 10." in found["curve-angle"]["note"]
 
 
+@pytest.mark.slow
 def test_intervals_are_shown_where_asked_for(work):
     result = run("--resamples", 50)
     assert result.exit_code == 0

@@ -67,6 +67,7 @@ def shares(name, ply, symmetric, angle_deg=7.0, distance=0.05, seeds=SEEDS):
     return halved, np.array(before), np.array(after)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "least", "ratio"), [("edge-icp", 0.6, 0.5), ("depth-icp", 0.9, 0.2)])
 def test_small_perturbations_converge(tug_ply, name, least, ratio):
     halved, before, after = shares(name, tug_ply, symmetric=False)
@@ -132,6 +133,7 @@ def test_a_pose_that_shows_nothing_fails_and_is_returned(tug, name, t_m):
     np.testing.assert_array_equal(result.T_cam_obj, start)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(BASELINES))
 def test_an_image_without_evidence_fails(tug, name):
     """A plain grey image has no edges and one colour; its depth is all unknown."""

@@ -249,6 +249,7 @@ def test_what_is_found_alone_does_not_depend_on_other_poses(tug, seen):
     assert alone.iterations >= len(CONFIG.rounds)
 
 
+@pytest.mark.slow
 def test_the_truth_agrees_best(tug, seen):
     _, truth, view, model = seen
     rng = np.random.default_rng(0)
@@ -334,6 +335,7 @@ def test_candidates_are_the_best_of_their_neighbourhood(tug):
     assert len(distinct_poses(T[[0, 2, 4] * 10], tug, CONFIG)) == 3
 
 
+@pytest.mark.slow
 def test_candidates_bring_a_far_start_to_the_truth(tug, seen):
     frame, truth, _, model = seen
     start = far_start(truth, 0)

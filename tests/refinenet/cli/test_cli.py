@@ -97,7 +97,7 @@ def test_train_errors_are_one_line(cli, dataset, tmp_path, arguments, code, text
 def test_a_folder_that_is_no_dataset_is_one_line(cli, tmp_path):
     result = cli("train", tmp_path, "--out", tmp_path / "run", *SMALL)
     assert result.exit_code == 1
-    assert "no shard dataset" in result.stderr
+    assert "not a shard dataset" in result.stderr
 
 
 @pytest.mark.slow

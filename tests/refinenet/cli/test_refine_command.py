@@ -6,6 +6,7 @@ import threading
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from posecore.bop import BopDataset, read_results, read_sidecar
 from posecore.raster import context
@@ -61,6 +62,7 @@ def test_a_machine_without_egl_gets_one_line(cli, bop, trained, tmp_path, monkey
     assert "libegl1" in line
 
 
+@pytest.mark.slow
 def test_refine_command(cli, bop, trained, tmp_path):
     root, start = bop
     out = tmp_path / "results" / "refined.csv"
@@ -110,6 +112,7 @@ def test_refine_command(cli, bop, trained, tmp_path):
     assert sidecar["initial_lines"] == [{2: 3, 3: 2}[doubted.line]]
 
 
+@pytest.mark.slow
 def test_what_was_finished_is_written_when_something_ends_it(cli, two_images, trained, tmp_path, monkeypatch):
     two, start, second = two_images
     picture = second.read_bytes()
@@ -196,6 +199,7 @@ def test_an_overlay_that_cannot_be_is_said_before_any_work(cli, bop, tmp_path):
     assert "a file stands where a folder is needed" in result.stderr
 
 
+@pytest.mark.slow
 def test_an_image_needs_a_camera_and_no_ground_truth(cli, two_images, tmp_path):
     root, start, _ = two_images
     (file,) = root.glob("test/*/scene_gt.json")
@@ -208,6 +212,7 @@ def test_an_image_needs_a_camera_and_no_ground_truth(cli, two_images, tmp_path):
     assert len(read_results(tmp_path / "x.csv")) == len(read_results(start))
 
 
+@pytest.mark.slow
 def test_a_camera_of_another_size_is_named_with_its_image(cli, two_images, tmp_path):
     root, start, image = two_images
     picture = cv2.imread(str(image))

@@ -68,6 +68,7 @@ def test_a_network_of_one_object_never_sees_the_other(two_objects, tmp_path):
     assert list(load(tmp_path / "run/best.safetensors").provenance.objects) == ["2"]
 
 
+@pytest.mark.slow
 def test_growing_datasets_bring_only_the_chosen_objects(two_objects, tmp_path):
     config = small("objects=[1]", "batch=4", "steps=8", "loader.follow=true", "loader.workers=0")
     train(config, str(two_objects), tmp_path / "run")

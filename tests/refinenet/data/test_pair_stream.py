@@ -136,7 +136,7 @@ def test_a_truncated_shard_is_named(dataset, training, tmp_path):
 
 
 def test_another_schema_and_no_dataset_are_errors(dataset, tmp_path):
-    with pytest.raises(ShardError, match="no shard dataset"):
+    with pytest.raises(ShardError, match="not a shard dataset"):
         ShardReader(str(tmp_path))
     copy = shutil.copytree(dataset, tmp_path / "copy")
     group = json.loads((copy / "zarr.json").read_text())

@@ -92,6 +92,7 @@ def test_new_shards_join_between_epochs_and_validation_scenes_stay_out(growing, 
     assert trained == set(range(24)) - set(HELD_OUT)
 
 
+@pytest.mark.slow
 def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path):
     url, reveal = growing
     first = iter(follow(url, tmp_path))
@@ -132,6 +133,7 @@ def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, mo
     assert json.loads((tmp_path / "run/data.json").read_text())["validation_scenes"] == validation_scenes_now
 
 
+@pytest.mark.slow
 def test_later_shards_bring_validation_pairs_until_there_are_enough(growing, tmp_path):
     url, reveal = growing
     options = ["loader.follow=true", "loader.workers=0", "validation.scene_fraction=0.2", "steps=16", "batch=4"]
@@ -210,6 +212,7 @@ def test_a_resumed_run_measures_what_it_did_before_others_joined(growing, tmp_pa
     assert resumed.best_mm == math.inf
 
 
+@pytest.mark.slow
 def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, monkeypatch, caplog):
     url, reveal = growing
     monkeypatch.setattr("refinenet.data.growing_split.POLL_S", 0.05)
@@ -253,6 +256,7 @@ def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(grow
     assert set(run.data.training.rows) == {0, 1, 2}
 
 
+@pytest.mark.slow
 def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_path, caplog):
     options = ["batch=4", "steps=16", "loader.shuffle_shards=3"]
     with pytest.raises(ShardError, match=r"scene_rgb/c/[23]/0/0/0: .*the shard is damaged"):
@@ -266,6 +270,7 @@ def test_damaged_shards_are_named_and_stop_the_run_unless_skipped(damaged, tmp_p
     assert [line["skipped_shards"] for line in lines if "skipped_shards" in line][-1] == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("group", [1, 3])
 def test_others_stand_in_for_damaged_shards_and_the_stream_still_resumes(dataset, damaged, group):
     options = ["loader.skip_bad_shards=true", f"loader.shuffle_shards={group}", "hypothesis.online=false"]

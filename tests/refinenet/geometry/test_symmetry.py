@@ -131,6 +131,7 @@ def test_the_contour_loss_does_not_mind_which_twin_is_the_truth(mesh, name):
     assert unaware.abs().max() > 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_torch_and_numpy_have_one_definition(mesh, name):
     """`posecore.symmetry.nearest_symmetric` is the reference: no samples of continuous symmetries at all."""

@@ -135,6 +135,7 @@ def test_where_nothing_is_seen_the_pose_stays(scenes, mesh):
     assert update.dt.abs().max() == 0
 
 
+@pytest.mark.slow
 def test_the_solution_has_true_gradients(scenes, mesh):
     """With errors of the pose's own model (true offsets), where weights, which carry none, do not matter."""
     _, guess, K_crop, _ = (x[:1] for x in scenes)
@@ -380,6 +381,7 @@ def run(dataset, tmp_path_factory):
     return checkpoint.load(out / "last.safetensors")
 
 
+@pytest.mark.slow
 def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
     """Every point is seen 1.2 px to the right and 0.8 px up in the patch: so the object is."""
     T = se3.make_T(se3.random_rotation(np.random.default_rng(3)), np.array([0.05, -0.02, 6 * mesh.diameter_m]))
@@ -397,6 +399,7 @@ def test_an_offset_moves_the_pose_that_far_across_the_image(run, mesh):
     assert 0 <= found.confidence <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("target", "output"), [("visible_iou", True), ("pose_quality", True), ("pose_quality", False)])
 def test_a_checkpoint_knows_what_its_confidence_says(dataset, mesh, tmp_path, target, output):
     says = [f"loss.confidence_target={target}"] if output else []

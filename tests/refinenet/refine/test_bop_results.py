@@ -88,6 +88,7 @@ def test_candidates_are_those_of_a_search(job):
         RefineJob(method=edges, dataset=job.dataset, init=job.init, out=job.out, candidates=job.out)
 
 
+@pytest.mark.slow
 def test_the_commands_import_torch_only_to_run():
     code = "import sys, refinenet.cli, refinenet.refine; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

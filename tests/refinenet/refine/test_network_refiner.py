@@ -212,6 +212,7 @@ def test_confidence_is_the_networks_where_it_has_one_and_else_of_the_gradients(m
     assert result.confidence == pytest.approx(1 / (1 + np.exp(-2)), abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_pool_is_ranked_and_its_best_is_returned(mesh, trained, frame, monkeypatch):
     """With a network that leaves poses where they are, the pool alone must bring the pose nearer."""
     image, truths = frame
@@ -329,6 +330,7 @@ def test_an_image_that_is_no_8_bit_rgb_is_refused(image, text):
         frame.__post_init__()
 
 
+@pytest.mark.slow
 def test_a_trained_checkpoint_knows_its_mesh_from_another(cli, dataset, mesh, tmp_path):
     """The digest that training stores fits the mesh that a BOP dataset or a file brings, and no other."""
     small = ["--steps", 1, "--batch", 4, "--workers", 0, "--threads", 1, "--set", "loss.contour_points=32"]

@@ -17,6 +17,7 @@ def job(scene, still, tmp_path):
     return TrackJob(method=method, source=root, init=root / "start.csv", out=tmp_path / "job" / "track.csv", threads=1)
 
 
+@pytest.mark.slow
 def test_a_job_writes_the_files_of_the_command(cli, job, tmp_path):
     calls = []
     summary = track_to_file(job, lambda done, total: calls.append((done, total)))

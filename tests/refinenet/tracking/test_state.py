@@ -91,6 +91,7 @@ def turned_about(axis, offset_m, angle_rad):
     return se3.make_T(R, np.asarray(offset_m) - R @ np.asarray(offset_m))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle_rad", [-3.0, -0.4, 0.0, 1e-3, 2.0])
 def test_an_object_of_revolution_does_not_spin(angle_rad):
     info = ModelInfo(diameter_m=0.1, symmetries_continuous=(AXIS,))

@@ -35,6 +35,7 @@ from ..conftest import HEIGHT_PX, WIDTH_PX, K
 from .conftest import BACK, FRAMES, GONE, still_checkpoint, write_scene
 
 
+@pytest.mark.slow
 def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
     root, truths = scene
     out, video = tmp_path / "track.csv", tmp_path / "track.mp4"
@@ -125,6 +126,7 @@ def test_search_is_believed_where_it_does_not_fail(cli, scene, tmp_path, monkeyp
     assert "No pose, 3 times: the best pose has a confidence of 0.42" in result.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("symmetries", "turn_deg"),
     [
@@ -204,6 +206,7 @@ def test_names_with_numbers_are_in_their_order(tmp_path):
     assert [(number, frame.image[0, 0, 0]) for number, frame in frames] == [(0, 1), (1, 2), (2, 10)]
 
 
+@pytest.mark.slow
 def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
     rng = np.random.default_rng(0)
     with VideoWriter(tmp_path / "whole.avi", 10) as writer:
@@ -221,6 +224,7 @@ def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
         seen.extend(number for number, _ in VideoFile(file=tmp_path / "cut.avi", camera=camera).frames(method))
 
 
+@pytest.mark.slow
 def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     root, _ = scene
     images = root / "test" / "000001" / "rgb"

@@ -40,6 +40,7 @@ def undisturbed(dataset, tmp_path_factory):
     return out
 
 
+@pytest.mark.slow
 def test_the_average_is_saved_and_measured(undisturbed, dataset):
     state = checkpoint.load_state(undisturbed, 6)
     saved = checkpoint.load(undisturbed / "last.safetensors").tensors
@@ -77,6 +78,7 @@ def test_a_disk_full_at_any_write_of_a_checkpoint_keeps_the_one_before(
         assert_same_weights(undisturbed, tmp_path, name)
 
 
+@pytest.mark.slow
 def test_a_run_is_not_resumed_under_other_circumstances(undisturbed, dataset, tmp_path, monkeypatch):
     state = checkpoint.load_state(undisturbed, 6)
     monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state | {"world": 4})

@@ -34,6 +34,7 @@ def run(dataset, tmp_path_factory):
     return out, errors, reports
 
 
+@pytest.mark.slow
 def test_a_run_writes_checkpoints_metrics_and_config(run, dataset):
     out, errors, reports = run
     names = {path.name for path in out.iterdir()}
@@ -160,6 +161,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(dataset, tmp_path):
     assert trainer.step == 0
 
 
+@pytest.mark.slow
 def test_every_loss_trains(dataset, tmp_path):
     for name in ("contour", "contour-forward", "mse", "point", "contour+point"):
         trainer = open_run(small(f"loss.name={name}"), str(dataset), tmp_path)
@@ -188,6 +190,7 @@ def test_the_paper_preset_takes_a_step(mesh, tmp_path):
     trainer.close()
 
 
+@pytest.mark.slow
 def test_an_unfinished_dataset_is_said_to_be_one(dataset, tmp_path, caplog):
     part = tmp_path / "part"
     shutil.copytree(dataset, part)

@@ -52,6 +52,7 @@ def crowded(tmp_path_factory, config_of, meshes):
     return folder
 
 
+@pytest.mark.slow
 def test_it_reads_back_as_bop_with_poses_that_match_the_images(written, tug):
     dataset = BopDataset(written)
     assert [(t.scene_id, t.im_id, t.obj_id, t.inst_count) for t in dataset.targets] == [(1, i, 1, 1) for i in range(3)]
@@ -142,6 +143,7 @@ def test_visibility_is_that_of_a_render_of_all_objects(crowded):
     assert hidden, "no object is hidden in part: the test shows nothing"
 
 
+@pytest.mark.slow
 def test_a_started_dataset_is_continued_to_the_same_bytes(crowded, tmp_path, config_of, meshes):
     class Stop(Exception):
         pass
@@ -180,6 +182,7 @@ def test_workers_make_the_same_bytes_and_one_that_is_killed_is_replaced(crowded,
     assert tree(tmp_path / "w") == tree(crowded)
 
 
+@pytest.mark.slow
 def test_workers_that_are_interrupted_leave_no_temporary_files(tmp_path, config_of, meshes):
     def stop(scene_id, im_id):
         (tmp_path / "w/.rgb.png.tmp").touch()
@@ -220,6 +223,7 @@ def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, 
     assert tree(out) == tree(crowded)
 
 
+@pytest.mark.slow
 def test_training_images_are_jpeg_share_their_scene_and_have_no_targets(tmp_path, config_of, meshes):
     config = config_of(*MANY, "scene.kind=tabletop", "tabletop.tables=2")
     write_dataset(tmp_path / "p", config, meshes, FramePlan(split="train_pbr", frames=3, frames_per_scene=2))
@@ -311,6 +315,7 @@ def test_the_pbr_preset_shows_many_objects_on_a_table(tmp_path, meshes):
         assert ((depth > 0) & ~np.any(masks, axis=0)).mean() > 0.1, "no table"
 
 
+@pytest.mark.slow
 def test_depth_steps_grow_for_far_scenes(config_of, meshes):
     from synthgen.draw.target import make_targets
 
@@ -341,6 +346,7 @@ def test_cycles_frames_match_the_rasteriser_and_do_not_depend_on_workers(tmp_pat
     assert seen > 500 and wrong < 0.03 * seen
 
 
+@pytest.mark.slow
 def test_the_commands_options_reach_the_dataset(tmp_path, tug_ply, small_set):
     from click.testing import CliRunner
     from synthgen.cli import main

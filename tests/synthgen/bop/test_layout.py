@@ -53,6 +53,7 @@ def test_floating_objects_keep_apart(layouts, together):
     assert several >= 6
 
 
+@pytest.mark.slow
 def test_objects_on_a_table_stand_on_it_beside_each_other(layouts):
     _, targets, made = layouts(
         "scene.kind=tabletop",
@@ -84,6 +85,7 @@ def test_one_object_is_a_pairs_scene(layouts):
         assert (layout.others, layout.lights, layout.background) == (base.others, base.lights, base.background)
 
 
+@pytest.mark.slow
 def test_cameras_are_aimed_at_an_object_from_its_distances(layouts):
     config, targets, made = layouts("scene.kind=tabletop", "tabletop.elevation_deg=[30, 50]", together=True)
     camera, rng = config.camera.camera(), np.random.default_rng(0)

@@ -13,6 +13,7 @@ FRAMES = 150
 SETTINGS = ("tabletop.tables=2", "frames.objects=[2, 3]", "frames.instances=3", "sequence.occluder_period_s=2")
 
 
+@pytest.mark.slow
 def test_waves_keep_their_bounds():
     t = np.linspace(0, 30, 4001)
     for seed in range(8):
@@ -27,6 +28,7 @@ def test_waves_keep_their_bounds():
     assert still(0.0) == still(9.0)
 
 
+@pytest.mark.slow
 def test_rotations_keep_their_speed():
     for seed in range(5):
         rotation = draw_rotation(np.random.default_rng(seed), np.pi, 1.2, 2.0)
@@ -45,6 +47,7 @@ def filmed(request, config_of, tug):
     maker.close()
 
 
+@pytest.mark.slow
 def test_nothing_jumps(filmed):
     config, target, views = filmed
     dt, diameter = 1 / config.sequence.fps, target.mesh.diameter_m
@@ -144,6 +147,7 @@ def test_a_frame_does_not_depend_on_the_one_before(config_of, tug, filmed):
     assert view.layout.sensor == views[77].layout.sensor
 
 
+@pytest.mark.slow
 def test_sequences_are_bop_scenes_from_1_on(tmp_path, config_of, tug):
     from posecore.bop import BopDataset
 

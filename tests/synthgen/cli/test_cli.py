@@ -111,6 +111,7 @@ def test_render_and_preview(tug_ply, tmp_path, small_set):
     assert "no rendered sample from 5 on" in error_line(result)
 
 
+@pytest.mark.slow
 def test_bop_renders_frames(tug_ply, tmp_path, small_set):
     result = invoke("bop", "--object", tug_ply, "--frames", 1, "--out", tmp_path / "bop", *small_set)
     assert result.exit_code == 0, result.output

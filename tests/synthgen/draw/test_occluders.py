@@ -10,6 +10,7 @@ from synthgen.draw.target import make_target
 from synthgen.inputs.assets import Assets
 
 
+@pytest.mark.slow
 def test_shapes_have_the_asked_sizes_and_repeat():
     config = OccluderConfig(library=12, size_diameter=(0.5, 0.8))
     shapes = occluders.primitive_shapes(config, seed=3, obj_id=1, diameter_m=0.2)
@@ -54,6 +55,7 @@ def test_shapes_stand_where_they_should_and_touch_nothing(tug_target, front, pro
                 assert position[2] < centre[2]
 
 
+@pytest.mark.slow
 def test_front_shapes_hide_part_of_the_object_but_not_too_much(maker_of):
     maker = maker_of("occluders.front=[2, 3]", "occluders.props=[0, 0]", "occluders.min_visible=0.5", "samples=1")
     visible = np.concatenate([maker.samples(i)["visible_fraction"] for i in range(12)])

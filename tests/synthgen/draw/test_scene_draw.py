@@ -62,6 +62,7 @@ def test_viewpoints_cover_the_sphere_by_default(config_of, tug_target):
     assert np.abs(R.mean(axis=0)).max() < 0.1  # uniform on SO(3): every entry has mean 0, deviation 0.58 / sqrt(600)
 
 
+@pytest.mark.slow
 def test_upright_keeps_the_objects_z_axis_up(config_of, tug_target):
     config = config_of("view.viewpoint=upright", "view.elevation_deg=[10, 60]", "view.roll_deg=[-5, 5]")
     for i in range(50):
@@ -121,6 +122,7 @@ def test_every_prefix_of_scenes_shows_all_objects_equally_often():
     assert len(orders) > 5
 
 
+@pytest.mark.slow
 def test_an_object_that_is_rejected_is_drawn_again(config_of, tug_target):
     other = replace(tug_target, obj_id=2)
     for index in range(6):

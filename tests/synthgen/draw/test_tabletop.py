@@ -38,6 +38,7 @@ def target(tug, config_of):
     return make_target(1, tug, config_of(*TABLETOP))
 
 
+@pytest.mark.slow
 def test_objects_lie_on_the_table_and_touch_it(config_of, target):
     for draw in draws(config_of(*TABLETOP, "tabletop.near_fraction=0"), target):
         half = target.tables[draw.around[0].mesh_key].vertices_m.max(axis=0)
@@ -49,6 +50,7 @@ def test_objects_lie_on_the_table_and_touch_it(config_of, target):
         assert (np.abs(on_table(draw, None)[:, :2]) <= half[:2] + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_nothing_on_the_table_stands_in_something_else(config_of, target):
     count = 0
     for draw in draws(config_of(*TABLETOP), target):
@@ -64,6 +66,7 @@ def test_nothing_on_the_table_stands_in_something_else(config_of, target):
     assert count > 100
 
 
+@pytest.mark.slow
 def test_near_objects_hover_within_their_range_in_any_orientation(config_of, target):
     config = config_of(*TABLETOP, "tabletop.near_fraction=1", "tabletop.hover_diameter=[0.1, 0.4]")
     lowest = [on_table(draw, None)[:, 2].min() / target.mesh.diameter_m for draw in draws(config, target)]
@@ -72,6 +75,7 @@ def test_near_objects_hover_within_their_range_in_any_orientation(config_of, tar
     assert np.ptp(lowest) > 0.2
 
 
+@pytest.mark.slow
 def test_the_camera_looks_down_within_the_elevations_and_distances(config_of, target):
     config = config_of(*TABLETOP, "tabletop.elevation_deg=[30, 50]", "view.roll_deg=[-10, 10]")
     for draw in draws(config, target):
@@ -119,6 +123,7 @@ def test_front_occluders_float_above_the_table(config_of, target):
     assert lying, "none had to be lifted"
 
 
+@pytest.mark.slow
 def test_objects_of_about_one_size_share_their_tables_and_scenes_stay_in_the_range_of_depth(config_of, tug):
     config = config_of(*TABLETOP)
     scaled = {i: replace(tug, vertices_m=tug.vertices_m * s) for i, s in ((1, 1.0), (2, 1.1), (3, 4.0))}
@@ -139,6 +144,7 @@ def test_objects_of_about_one_size_share_their_tables_and_scenes_stay_in_the_ran
         assert deepest < 65535 * depth_step_m([target])
 
 
+@pytest.mark.slow
 def test_tables_are_cut_from_photographs_where_there_are_some(tmp_path):
 
     cv2.imwrite(str(tmp_path / "red.png"), np.full((64, 64, 3), (0, 0, 250), np.uint8))

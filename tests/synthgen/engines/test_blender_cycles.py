@@ -49,6 +49,7 @@ def same(a: RenderedScene, b: RenderedScene) -> bool:
     return all(getattr(a, n).tobytes() == getattr(b, n).tobytes() for n in ("rgb_linear", "alpha", "depth_m", "index"))
 
 
+@pytest.mark.slow
 def test_importing_the_contract_leaves_blender_alone():
     code = "import sys, synthgen.engines.make, synthgen.scene; sys.exit('bpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
@@ -89,6 +90,7 @@ def test_depth_is_camera_z_at_the_pixel_centre(cycles):
     np.testing.assert_allclose(layers.depth_m[v, u], expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_geometry_agrees_with_the_rasteriser(cycles, meshes):
     rng = np.random.default_rng(3)
     with Rasteriser(meshes) as raster:

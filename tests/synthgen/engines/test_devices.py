@@ -36,6 +36,7 @@ def test_gpus_keep_the_names_that_the_environment_gives(monkeypatch):
     assert devices.visible_gpus(2) == ("2", "5")
 
 
+@pytest.mark.slow
 def test_the_card_names_a_device_and_never_auto(monkeypatch, tug_ply):
     monkeypatch.setattr(render, "list_gpus", lambda: {"optix": 2, "cuda": 2})
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)

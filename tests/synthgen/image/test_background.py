@@ -22,6 +22,7 @@ def test_drawn_backgrounds_differ_in_colour_and_texture():
     assert texture.max() > 15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (3, 200), (640, 480)])
 def test_any_size_can_be_drawn(size):
     for seed in range(12):

@@ -80,6 +80,7 @@ def test_time_and_space_are_extrapolated():
     assert report.missing == ["disk space", "cycles"]
 
 
+@pytest.mark.slow
 def test_checks_without_measuring_are_json_on_demand(no_blender, tmp_path):
     result = CliRunner().invoke(main, ["doctor", "--seconds", "0", "--json", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output

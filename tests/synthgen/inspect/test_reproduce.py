@@ -32,6 +32,7 @@ def only(tug_ply, small_set):
     return invoke
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", [0, 3, 8])
 def test_a_sample_is_made_again_bit_for_bit(dataset_and_job, only, index):
     result = only(dataset_and_job[0], index)
@@ -40,6 +41,7 @@ def test_a_sample_is_made_again_bit_for_bit(dataset_and_job, only, index):
     assert result.stdout == expected
 
 
+@pytest.mark.slow
 def test_a_scene_from_quarantine_is_made_again_too(dataset_and_job, only, tmp_path, config_of, tug):
     url, job = dataset_and_job
     assert "identical" in only(url, 2 * REPLACED + 1).stdout
@@ -50,6 +52,7 @@ def test_a_scene_from_quarantine_is_made_again_too(dataset_and_job, only, tmp_pa
     assert not np.array_equal(made.sample["T_cam_obj"], stored["T_cam_obj"][0]), "the quarantine changed nothing"
 
 
+@pytest.mark.slow
 def test_it_says_which_fields_differ_and_by_how_much(dataset_and_job, only, tmp_path):
     url = shutil.copytree(dataset_and_job[0], tmp_path / "shards")
     reader = ShardReader(str(url))

@@ -92,6 +92,7 @@ def test_every_check_of_a_dataset_passes(images, window, tmp_path):
     assert "<dt>engine</dt>" not in page
 
 
+@pytest.mark.slow
 def test_windows_follow_the_distance_or_not(images):
     followed, fixed = (cut_plan.plan(images, CutConfig(**SMALL, window=w)) for w in ("diameter", "fixed"))
     for image in followed.images:
@@ -182,6 +183,7 @@ def test_without_visible_masks_the_annotated_objects_hide_one_another(tug, confi
     assert ((with_masks != without) & whole).sum() < 0.1 * (whole & ~with_masks).sum()
 
 
+@pytest.mark.slow
 def test_hypotheses_of_a_result_file_belong_to_the_nearest_instance(images, tmp_path):
     rng = np.random.default_rng(0)
     there = poses(images)
@@ -217,6 +219,7 @@ def test_a_hypothesis_of_a_pose_that_is_left_out_is_not_another_ones(images, tmp
     assert planned.left_out["hypotheses are of poses that are left out"] == 1
 
 
+@pytest.mark.slow
 def test_what_cannot_be_cut_is_left_out_and_counted(images, tmp_path):
     (s, i, gt), *_ = poses(images)
     far = gt.T_cam_obj.copy()
@@ -248,6 +251,7 @@ def test_the_same_line_twice_is_one_pair(images, tmp_path):
     assert cut_plan.plan(images, CutConfig(**SMALL), tmp_path / "guesses.csv").n == 1
 
 
+@pytest.mark.slow
 def test_some_images_evenly_spread(images):
     planned = cut_plan.plan(images, CutConfig(**SMALL, images=2))
     assert [image.im_id for image in planned.images] == [0, 2]
@@ -302,6 +306,7 @@ def test_what_is_visible_beyond_the_mesh_stays_foreground(images, own, tmp_path)
     assert [f.name for f in verify(str(tmp_path / "beyond")).findings if not f.ok] == []
 
 
+@pytest.mark.slow
 def test_a_source_that_changed_is_another_one(images, own, tmp_path):
     planned = cut_plan.plan(images, CutConfig(**SMALL))
     same = cut_plan.plan(own, CutConfig(**SMALL))
@@ -311,6 +316,7 @@ def test_a_source_that_changed_is_another_one(images, own, tmp_path):
     assert cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL)).digest != planned.digest
 
 
+@pytest.mark.slow
 def test_fixed_windows_need_one_focal_length(own):
     file = own.split_path / "000001" / "scene_camera.json"
     cameras = json.loads(file.read_text())
@@ -387,6 +393,7 @@ def test_workers_do_not_change_a_byte(images, tmp_path):
     assert one == two
 
 
+@pytest.mark.slow
 def test_the_seed_decides_hypotheses(images):
     first, again, other = (cut_plan.plan(images, CutConfig(**SMALL, seed=seed)) for seed in (1, 1, 2))
 
@@ -397,6 +404,7 @@ def test_the_seed_decides_hypotheses(images):
     assert not np.array_equal(np.sort(drawn(first), axis=0), np.sort(drawn(other), axis=0))
 
 
+@pytest.mark.slow
 def test_wrong_inputs_are_one_line_each(images, own, tmp_path):
     (tmp_path / "empty.csv").write_text("scene_id,im_id,obj_id,score,R,t,time\n")
     with pytest.raises(DatasetError, match=r"empty\.csv: holds no pose"):
@@ -424,6 +432,7 @@ def test_wrong_inputs_are_one_line_each(images, own, tmp_path):
         cut_plan.plan(BopDataset(own.root), CutConfig(**SMALL))
 
 
+@pytest.mark.slow
 def test_from_the_command_line(images, tmp_path):
     settings = ["--patch-px", "64", "--set", "contour_points=20", "--hypotheses-per-pose", "1", "--seed", "3"]
     arguments = ["cut", str(images.root), "--out", str(tmp_path / "shards"), *settings, "--set", "min_visible=0.5"]

@@ -39,6 +39,7 @@ def run(*arguments):
     return CliRunner().invoke(main, ["export", "--quiet", *map(str, arguments)])
 
 
+@pytest.mark.slow
 def test_hdf5_holds_every_field(shards, stored, tmp_path):
     result = run(shards, tmp_path / "out.h5")
     assert result.exit_code == 0, result.output

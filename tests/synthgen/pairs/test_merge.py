@@ -34,6 +34,7 @@ def tree(folder):
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.slow
 def test_all_pairs_are_there_in_order_and_no_scene_is_two(parts, tmp_path):
     out = tmp_path / "both"
     result = CliRunner().invoke(main, ["merge", *parts, "--out", str(out), "--quiet"])
@@ -86,6 +87,7 @@ def test_windows_of_several_sides_are_told(parts, config_of, tug, tmp_path):
     assert card["objects"]["1"]["window_side_px"] == max(sides) > min(sides)
 
 
+@pytest.mark.slow
 def test_what_does_not_fit_together_is_one_line(parts, config_of, tug, bobbin_ply, tmp_path):
     write_dataset(tmp_path / "small", config_of("patch_px=32"), {1: tug}, 4)
     with pytest.raises(ShardError, match=r"small: patch_px is 32, expected 48 as in .*tug"):
@@ -103,6 +105,7 @@ def test_what_does_not_fit_together_is_one_line(parts, config_of, tug, bobbin_pl
     assert "give two datasets or more" in alone.output
 
 
+@pytest.mark.slow
 def test_scenes_that_may_be_the_same_keep_one_number(parts, config_of, tug, tmp_path):
     """Training holds out whole scenes: with two numbers one could be on both sides."""
     write_dataset(tmp_path / "more", config_of("hypotheses_per_scene=4"), {1: tug}, 16)

@@ -65,6 +65,7 @@ def test_the_window_is_fixed_and_centred_on_the_hypothesis(maker_of, tug_target)
         np.testing.assert_allclose(s["K_crop"][i], crop_K(s["K"][i], Window(x0_px=x0, y0_px=y0, side_px=side), 48))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patch_px", [48, 300])  # coarser and finer than the camera's own pixels
 def test_the_image_shows_the_object_inside_its_contour(maker_of, patch_px):
     """The colours of S change at the contour: an image that is mirrored or half a pixel off fails."""
@@ -115,6 +116,7 @@ def test_the_contour_is_not_cut_by_occluders(maker_of):
     assert np.array_equal(free["scene_contour_cam_m"], hidden["scene_contour_cam_m"])
 
 
+@pytest.mark.slow
 def test_outside_the_image_is_black_and_not_visible(maker_of):
     maker = maker_of(*PLAIN, "view.position_jitter=1.0", "view.min_inside=0.3", "occluders.min_visible=0.1")
     found = 0
@@ -142,6 +144,7 @@ def test_hypotheses_share_the_scene_and_keep_is_a_prefix(maker_of):
         assert np.array_equal(s[name][:2], first[name]), name
 
 
+@pytest.mark.slow
 def test_samples_do_not_depend_on_what_was_rendered_before(maker_of):
     a, b = maker_of(), maker_of()
     for i in (4, 0, 7):

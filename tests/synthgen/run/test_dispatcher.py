@@ -47,6 +47,7 @@ def reference(tmp_path_factory, tug_ply, small_set):
     return out
 
 
+@pytest.mark.slow
 def test_the_dataset_is_complete_and_in_scene_order(reference):
     reader = ShardReader(str(reference))
     assert reader.complete

@@ -167,6 +167,7 @@ def test_a_worker_says_why_it_cannot_render(tug, config_of):
     assert "cannot read /nowhere/a.png (2 of 2 photographs" in worker.find_problem(lost, 1)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_does_not_answer_is_one_line(tmp_path, tug_ply, small_set, monkeypatch):
     monkeypatch.setattr(dask_cluster, "ANSWER_S", 1.0)
     for address in ("tcp://127.0.0.1:9", "node0"):

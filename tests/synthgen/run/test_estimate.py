@@ -23,6 +23,7 @@ def job_of(config_of, tug_ply):
     return make
 
 
+@pytest.mark.slow
 def test_the_estimate_is_near_what_a_dataset_takes(job_of, tmp_path):
     job = job_of(16, "shard_size=8")
     measured = estimate.estimate(job, scenes=3)
@@ -38,12 +39,14 @@ def test_the_last_shard_alone_is_enough(job_of):
     assert estimate.measure_scenes(job_of(1), 4, 5.0).pairs == 2  # one scene of one sample, rendered twice
 
 
+@pytest.mark.slow
 def test_settings_that_cannot_be_rendered_fail_the_estimate(job_of):
     job = job_of(8, "window.min_area_px=2000")
     with pytest.raises(PoseError, match="scene 0"):
         estimate.estimate(job)
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_or_hangs_is_one_line():
     with pytest.raises(RenderError, match="the renderer died at the first scenes, exit code -6"):
         estimate.in_own_process(os.abort, timeout_s=60)
