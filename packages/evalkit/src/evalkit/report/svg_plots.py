@@ -6,6 +6,7 @@ from html import escape
 
 import numpy as np
 from jaxtyping import Float
+from posecore.html import figure, ticks
 
 ToDrawing = Callable[[float, float], tuple[float, float]]
 """From data coordinates to the drawing's."""
@@ -78,16 +79,6 @@ def cumulative(values: Float[np.ndarray, " n"], limit: float, steps: int = 121) 
     return thresholds, np.searchsorted(ordered, thresholds, side="right") / max(1, len(values))
 
 
-def ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """About `count` round numbers from `low` to `high`."""
-    span = max(high - low, 1e-12)
-    raw = span / count
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
-    first = np.ceil(low / step - 1e-9) * step
-    return [float(value) + 0.0 for value in np.arange(first, high + step * 1e-6, step)]  # + 0.0: no minus zero
-
-
 def round_limit(value: float) -> float:
     """The smallest round number that is not below a positive value: 1, 1.5, 2, 3, 5 or 7.5 times a power of ten."""
     power = 10.0 ** np.floor(np.log10(value))
@@ -136,17 +127,7 @@ def line_plot(
         f'<text transform="translate(14 {middle_y:.0f}) rotate(-90)" text-anchor="middle">{escape(y_label)}</text>'
     )
     description = "; ".join(_described(line, x_low, x_high, is_fraction) for line in series)
-    return figure(title, f"{x_label} against {y_label}. {description}", "".join(parts), HEIGHT)
-
-
-def figure(title: str, description: str, parts: str, height: float, width: float = WIDTH, kind: str = "") -> str:
-    """A drawing with its title above and a description for screen readers."""
-    mark = f' class="{kind}"' if kind else ""
-    return (
-        f"<figure{mark}><figcaption>{escape(title)}</figcaption>"
-        f'<svg viewBox="0 0 {width:g} {height:g}" role="img"><title>{escape(title)}</title>'
-        f"<desc>{escape(description)}</desc>{parts}</svg></figure>"
-    )
+    return figure(title, f"{x_label} against {y_label}. {description}", "".join(parts), (WIDTH, HEIGHT))
 
 
 def _top(series: Sequence[Series]) -> float:
@@ -286,7 +267,7 @@ def stacked_bar(title: str, parts: Sequence[Part], fractions: Sequence[float]) -
     description = [
         f"{part.name} {100 * fraction:.1f} %" for part, fraction in zip(parts, fractions, strict=True) if fraction > 0
     ]
-    return figure(title, ", ".join(description), "".join(drawn), BAR_HEIGHT, BAR_WIDTH, kind="bar")
+    return figure(title, ", ".join(description), "".join(drawn), (BAR_WIDTH, BAR_HEIGHT), kind="bar")
 
 
 def part_legend(parts: Sequence[Part]) -> str:

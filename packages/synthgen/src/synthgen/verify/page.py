@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 from posecore.errors import ShardError, StorageError
+from posecore.html import definitions, document
 from posecore.shard import ShardReader
 
 from synthgen.inspect.preview import Image, sample_row, title_row
@@ -68,11 +69,7 @@ def report_page(report: VerificationReport) -> str:
         _section("Data card", _card(report)),
         "</main>",
     ]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(title)}</title><style>{STYLE}</style></head><body>{''.join(body)}</body></html>\n"
-    )
+    return document(title, STYLE, "".join(body))
 
 
 def _section(heading: str, *parts: str) -> str:
@@ -211,8 +208,7 @@ def _card(report: VerificationReport) -> str:
         "objects": "; ".join(_object_text(i, entry) for i, entry in card["objects"].items()),
         "versions": ", ".join(f"{name} {version}" for name, version in card.get("versions", {}).items()),
     }
-    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries.items())
-    return f"<dl>{items}</dl>"
+    return definitions(entries)
 
 
 def _origin(report: VerificationReport) -> dict[str, str]:

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
+from posecore.html import figure, ticks
 
 from synthgen.verify.coverage import sectors_in
 
@@ -26,26 +27,26 @@ def histogram(
     outside = int(((finite < low) | (finite > high)).sum()) + len(values) - len(finite)
     label = x_label + (f" ({outside} samples outside of the axis)" if outside else "")
     names = [f"{a:.4g} to {b:.4g}" for a, b in pairwise(edges.tolist())]
-    ticks = [(value, f"{value:.4g}") for value in _ticks(low, high)]
-    return _figure(title, label, counts, names, [((v - low) / (high - low), t) for v, t in ticks])
+    marks = [((value - low) / (high - low), f"{value:.4g}") for value in ticks(low, high)]
+    return _figure(title, label, counts, names, marks)
 
 
 def bars(title: str, x_label: str, counts: Mapping[str, int]) -> str:
     """Samples by name; with many names only some are labelled."""
     names = list(counts)
     every = max(1, -(-len(names) // 12))
-    ticks = [((i + 0.5) / len(names), name) for i, name in enumerate(names) if i % every == 0]
-    return _figure(title, x_label, np.array(list(counts.values())), names, ticks)
+    marks = [((i + 0.5) / len(names), name) for i, name in enumerate(names) if i % every == 0]
+    return _figure(title, x_label, np.array(list(counts.values())), names, marks)
 
 
 def _figure(
-    title: str, x_label: str, counts: Int[np.ndarray, " b"], names: Sequence[str], ticks: Sequence[tuple[float, str]]
+    title: str, x_label: str, counts: Int[np.ndarray, " b"], names: Sequence[str], marks: Sequence[tuple[float, str]]
 ) -> str:
     total, top = max(1, int(counts.sum())), max(1, int(counts.max(initial=0)))
     across, down = WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM
     width = across / max(1, len(counts))
     parts = []
-    for fraction in _ticks(0.0, top / total, 4):
+    for fraction in ticks(0.0, top / total, 4):
         y = TOP + down * (1 - fraction * total / top)
         parts.append(f'<path class="grid" d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{100 * fraction:.3g}%</text>')
@@ -55,7 +56,7 @@ def _figure(
             f'<rect x="{LEFT + i * width:.1f}" y="{TOP + down - height:.1f}" width="{max(width - 1, 0.5):.1f}" '
             f'height="{height:.1f}" fill="{BAR}"><title>{escape(names[i])}: {count} samples</title></rect>'
         )
-    for position, text in ticks:
+    for position, text in marks:
         parts.append(
             f'<text x="{LEFT + position * across:.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
             f"{escape(text)}</text>"
@@ -63,11 +64,8 @@ def _figure(
     parts.append(f'<path class="axis" d="M{LEFT} {TOP + down}H{WIDTH - RIGHT}"/>')
     parts.append(f'<text x="{LEFT + across / 2:.0f}" y="{HEIGHT - 8}" text-anchor="middle">{escape(x_label)}</text>')
     full = [name for name, count in zip(names, counts.tolist(), strict=True) if count]
-    label = f"{title}: {total} samples, from {full[0]} to {full[-1]}" if full else f"{title}: no samples"
-    return (
-        f'<figure><figcaption>{escape(title)}</figcaption><svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" '
-        f'aria-label="{escape(label)}">{"".join(parts)}</svg></figure>'
-    )
+    description = f"{total} samples, from {full[0]} to {full[-1]}" if full else "no samples"
+    return figure(title, description, "".join(parts), (WIDTH, HEIGHT))
 
 
 def sphere_maps(upper: Int[np.ndarray, " c"], lower: Int[np.ndarray, " c"], rings: int) -> str:
@@ -97,13 +95,12 @@ def sphere_maps(upper: Int[np.ndarray, " c"], lower: Int[np.ndarray, " c"], ring
         parts.append(f'<text x="{middle_x}" y="{top + 2 * radius + 15}" text-anchor="middle">-y</text>')
     number, holes = len(upper) + len(lower), int((upper == 0).sum() + (lower == 0).sum())
     summary = f"{total} scenes in {number} cells of equal area, {holes} cells empty, at most {most} scenes a cell"
-    return (
-        '<figure class="wide"><figcaption>Camera direction, object frame</figcaption>'
-        f'<svg viewBox="0 0 {4 * (radius + pad)} {2 * radius + 48}" role="img" '
-        f'aria-label="Camera direction: {summary}">'
-        f'{"".join(parts)}</svg><p class="soft">{summary}. {_key(most)} A disc shows a hemisphere around its pole, the '
-        "rim is the object's xy plane.</p></figure>"
+    note = (
+        f'<p class="soft">{summary}. {_key(most)} A disc shows a hemisphere around its pole, '
+        "the rim is the object's xy plane.</p>"
     )
+    size = (4 * (radius + pad), 2 * radius + 48)
+    return figure("Camera direction, object frame", summary, "".join(parts), size, kind="wide", note=note)
 
 
 def _cell(ring: int, sector: int, width: float) -> str:
@@ -139,12 +136,9 @@ def position_map(
         f'<rect class="ring" x="{across / 6:.1f}" y="{down / 6:.1f}" width="{across / 1.5:.1f}" '
         f'height="{down / 1.5:.1f}"/>'
     )
-    label = f"Window centres in the image of {width_px} x {height_px} px: {int(finite.sum())} samples"
-    return (
-        "<figure><figcaption>Window centre in the image</figcaption>"
-        f'<svg viewBox="0 0 {across:.0f} {down:.0f}" role="img" aria-label="{label}">{"".join(parts)}</svg>'
-        f'<p class="soft">The frame is the image, {width_px} x {height_px} px.</p></figure>'
-    )
+    description = f"Image of {width_px} x {height_px} px: {int(finite.sum())} samples"
+    note = f'<p class="soft">The frame is the image, {width_px} x {height_px} px.</p>'
+    return figure("Window centre in the image", description, "".join(parts), (across, round(down)), note=note)
 
 
 def _shade(count: int, most: int) -> str:
@@ -157,12 +151,3 @@ def _shade(count: int, most: int) -> str:
 def _key(most: int) -> str:
     chips = ((EMPTY, "none"), (_shade(1, max(2, most)), "few"), (_shade(most, most), f"{most}"))
     return " ".join(f'<span class="chip" style="background:{colour}"></span>&nbsp;{text}' for colour, text in chips)
-
-
-def _ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """About `count` round numbers from `low` to `high`."""
-    raw = max(high - low, 1e-12) / count
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= raw * 0.999)
-    first = np.ceil(low / step - 1e-9) * step
-    return [float(value) + 0.0 for value in np.arange(first, high + step * 1e-6, step)]

@@ -1,5 +1,7 @@
 """The report's page: one file without external resources, readable from 360 px to wide screens."""
 
+from posecore.html import definitions
+
 from evalkit.report.html.document import page
 from evalkit.report.html.elements import (
     Picture,
@@ -7,7 +9,6 @@ from evalkit.report.html.elements import (
     beside,
     case,
     cases,
-    definitions,
     fold,
     heading,
     items,

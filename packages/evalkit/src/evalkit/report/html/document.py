@@ -5,6 +5,8 @@ from functools import cache
 from html import escape
 from importlib.resources import files
 
+from posecore.html import document
+
 from evalkit.report.html.elements import Section
 
 
@@ -27,12 +29,8 @@ def page(title: str, head: str, sections: Sequence[Section]) -> str:
         f'<section id="{section.anchor}"><h2>{escape(section.heading)}</h2>{"".join(section.parts)}</section>'
         for section in shown
     )
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<link rel="icon" href="data:,">'  # no request for a favicon
-        f"<title>{escape(title)}</title><style>{_asset('style.css')}</style></head><body>"
+    content = (
         f'<nav class="contents" aria-label="Contents"><ul>{links}</ul></nav>'
         f"<main><header><h1>{escape(title)}</h1>{head}</header>{body}</main>"
-        f"<script>{_asset('sort.js')}</script></body></html>\n"
     )
+    return document(title, _asset("style.css"), content, _asset("sort.js"))

@@ -1,6 +1,6 @@
-"""Pieces of a page: sections, paragraphs, lists of terms, cases with pictures. Every text is escaped here."""
+"""Pieces of a page: sections, paragraphs, cases with pictures. Every text is escaped here."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 
@@ -47,12 +47,6 @@ def cases(articles: Sequence[str], pictures_each: int) -> str:
     """A grid of cases, each wide enough for its pictures."""
     width = 20 + 190 * max(1, min(pictures_each, 4))
     return f'<div class="cases" style="--case: {width}px">{"".join(articles)}</div>'
-
-
-def definitions(entries: Mapping[str, str]) -> str:
-    """Terms and their definitions."""
-    items = "".join(f"<dt>{escape(term)}</dt><dd>{escape(text)}</dd>" for term, text in entries.items())
-    return f"<dl>{items}</dl>" if items else ""
 
 
 def text(plain: str) -> str:

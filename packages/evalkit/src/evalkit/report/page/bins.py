@@ -6,6 +6,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from posecore.html import figure
 
 from evalkit.report import html, svg_plots
 from evalkit.report.svg_plots import LineStyle, Series
@@ -137,7 +138,7 @@ def _viewpoint_map(name: str, records: Sequence[Record]) -> str:
         f"{record['view_elevation_deg_low']:g} to {record['view_elevation_deg_high']:g}: {record['value']:.2f}"
         for record in records
     )
-    return svg_plots.figure(f"Mean VSS by viewpoint, {name}", description, "".join(drawn), bottom + 46, width)
+    return figure(f"Mean VSS by viewpoint, {name}", description, "".join(drawn), (width, bottom + 46))
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
