@@ -35,7 +35,7 @@ def vertices(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     return fraction
 
 
-_OTHER_GL = "2 pixels are free: the pixels that an edge covers depend on the GL driver and on the tile"
+_OTHER_GL = "2 pixels are free: the pixels that an edge covers depend on the GL driver"
 
 
 @CHECKS.register("ground truth re-rendered", 0.05, "fraction of the contour", _OTHER_GL, rerendered=True)
