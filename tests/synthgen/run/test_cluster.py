@@ -15,11 +15,11 @@ def test_a_worker_that_the_cluster_drops_is_started_again(monkeypatch):
     with cluster.connect(1, None) as client:
         before = client.run(os.getpid)
         os.kill(next(iter(before.values())), signal.SIGKILL)
-        dropped, suspected, deadline = False, set(), time.monotonic() + 100
-        while not dropped or not client.nthreads():
-            assert time.monotonic() < deadline
+        dropped, suspected, after = False, set(), {}
+        while not after:  # the address of a dropped worker answers with an error for a while: ignored
             dropped = dropped or not client.cluster.workers
             time.sleep(0.1)
             if dropped:
                 suspected = cluster.revive(client.cluster, suspected)
-        assert client.run(os.getpid) != before
+                after = client.run(os.getpid, on_error="ignore")
+        assert not {*after.values()} & {*before.values()}
