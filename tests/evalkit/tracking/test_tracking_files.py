@@ -199,7 +199,7 @@ def test_the_removed_option_is_refused(sequence, tmp_path):
     write_results(tmp_path / "r.csv", tugs())
     result = run("--dataset", sequence, "--results", tmp_path / "r.csv", "--choi-legacy")
     assert result.exit_code == 2
-    assert "--choi-legacy is now removed: angles are those of the residual rotation" in result.stderr
+    assert "--choi-legacy is now obsolete: angles are those of the residual rotation" in result.stderr
 
 
 def test_perturbed_starts_are_no_sequence(sequence, tmp_path):

@@ -17,7 +17,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 @click.option("--scene", "scenes", multiple=True, type=int, help="Only this sequence. Repeatable.")
 @click.option("--object", "objects", multiple=True, type=int, help="Only this object. Repeatable.")
 @click.option("--all-frames", is_flag=True, help="Score every annotated pose, not only the targets.")
-@renamed_options({"--choi-legacy": "removed: angles are those of the residual rotation"})
+@renamed_options({"--choi-legacy": "obsolete: angles are those of the residual rotation"})
 @click.option("--by-axis", is_flag=True, help="The paper's layout: a row for each axis, a column for each file.")
 @click.option(
     "--resamples",

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from posecore import config as posecore_config
+from posecore.renamed import refuse_renamed_keys
 
 from refinenet.config.checks import require
 from refinenet.config.renamed import RENAMED
@@ -30,6 +31,7 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
         mapping = posecore_config.merge(mapping, posecore_config.load_yaml(file))
         where = str(file)
     full = [f"network.{item}" if item.startswith(("backbone.", "backbone=")) else item for item in overrides]
+    refuse_renamed_keys(posecore_config.apply_overrides({}, full), RENAMED, "--set")
     mapping = posecore_config.apply_overrides(mapping, full)
     config = posecore_config.build(TrainConfig, mapping, where, renamed=RENAMED)
     require_used(config, posecore_config.assigned_keys(full))

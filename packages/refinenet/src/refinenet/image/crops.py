@@ -19,7 +19,7 @@ def hypothesis_window(
     mesh: Mesh,
     fixed_side_px: float,
 ) -> Window:
-    """The window that inference cuts for a hypothesis.
+    """The window around a hypothesis in training; `refine.patches` computes the same one for an image at inference.
 
     Args:
         config: Kind and scale.

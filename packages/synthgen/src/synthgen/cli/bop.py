@@ -91,6 +91,6 @@ def bop(
     config = load_config(preset, overrides, values)
     job = BopJob(out=out, plan=plan, config=config, sources=sources, workers=workers)
     with resumable(out), progress_bar(quiet) as bar:
-        task = bar.add_task("frames", total=job.frames)
-        summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.advance(task))
+        task = bar.add_task("frames", total=job.frames, visible=False)
+        summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.update(task, advance=1, visible=True))
     click.echo(summary.text, err=True)
