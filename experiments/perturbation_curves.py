@@ -8,8 +8,8 @@ that diverged (more than 45 degrees or half a diameter away at the end). The pap
 
 Here test images are rendered, scenes that no network was trained on.
 
-  --smoke  the example object, its shipped checkpoints, 1 image, 3 starts: a test of the plumbing
-  --small  the same with 24 images; nothing is trained
+  --smoke  the example object, one shipped checkpoint, edge ICP, 1 image, 3 starts: a test of the plumbing
+  --small  the example object, its shipped checkpoints, every method without a network, 24 images; nothing is trained
   --full   LM-O's meshes (--data), a network of preset paper for each loss and object as in the paper, 200 000
            path-traced pairs each, 100 images an object; a GPU
 
@@ -21,6 +21,8 @@ import json
 import sys
 from pathlib import Path
 from typing import Any
+
+from refinenet.refine.registry import BASELINES
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments.chain import Step, quoted
@@ -49,7 +51,8 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             objects=f"--object {quoted(TUG)}",
             scenes=f"--preset quickstart --engine raster {inputs.behind()}",
             frames=FRAMES[size],
-            networks=SHIPPED,
+            networks={"shipped": SHIPPED["shipped"]} if size == "smoke" else SHIPPED,
+            baselines=("edge-icp",) if size == "smoke" else tuple(BASELINES),
             initial="--angles 15,45 --translations 0.2" if size == "smoke" else PROTOCOL,
             iterations=10,
         ),

@@ -3,7 +3,6 @@
 import importlib.util
 import re
 import shlex
-import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
@@ -13,6 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
+from children import run
 from posecore import config as config_tools
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -137,7 +137,7 @@ def site(tmp_path_factory) -> Path:
     """The built pages; a warning stops the build."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, check=False)
+    done = run(command, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
     return folder
 

@@ -4,13 +4,13 @@ import ast
 import importlib
 import inspect
 import re
-import subprocess
 import sys
 import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from children import run
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PAGE = REPOSITORY / "docs" / "python.md"
@@ -101,13 +101,12 @@ def test_arguments_of_calls_exist():
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_examples_run(tmp_path):
     (tmp_path / "examples").symlink_to(REPOSITORY / "examples")
     body = textwrap.indent("\n".join(examples()), "    ")
     script = tmp_path / "script.py"
     script.write_text(f"def main():\n{body}\n\n\nif __name__ == '__main__':\n    main()\n", encoding="utf-8")
-    done = subprocess.run([sys.executable, script.name], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run([sys.executable, script.name], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for name in ("run/best.safetensors", "refined.csv", "track.csv", "report/index.html"):
         assert (tmp_path / name).is_file(), name

@@ -10,6 +10,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+from children import run
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from experiments import chain
@@ -28,7 +29,7 @@ def quickstart():
 
 def smoke(work: Path) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, str(SCRIPT), str(work), "--smoke"]
-    return subprocess.run(command, capture_output=True, text=True, timeout=280)
+    return run(command)
 
 
 @pytest.mark.slow

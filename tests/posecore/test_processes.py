@@ -1,13 +1,13 @@
 """Pools of processes that end at once when something goes wrong."""
 
 import os
-import subprocess
 import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 
 import pytest
+from children import run
 from posecore import processes
 from posecore.errors import RenderError
 from posecore.processes import behave_as_worker, in_order, map_unordered, spawned, unordered
@@ -27,15 +27,13 @@ def interrupted():
     with spawned(2, behave_as_worker, (), "died") as pool:
         assert pool.submit(abs, -1).result() == 1
         for _ in range(4):
-            pool.submit(time.sleep, 60)
+            pool.submit(time.sleep, 7200)
         raise ValueError("enough")
 
 
 def test_an_error_does_not_wait_for_tasks_that_run():
-    began = time.monotonic()
     with pytest.raises(ValueError, match="enough"):
-        interrupted()
-    assert time.monotonic() - began < 30
+        interrupted()  # would not end within the time limit of a test
 
 
 ENDS = """
@@ -52,7 +50,7 @@ with spawned(2, behave_as_worker, (), "died") as pool:
 
 @pytest.mark.parametrize("seconds", [0.05, 0.2, 0.4])
 def test_nor_for_the_rest_of_a_result_that_is_being_sent(seconds):
-    ended = subprocess.run([sys.executable, "-c", ENDS.format(seconds)], timeout=60, capture_output=True, text=True)
+    ended = run([sys.executable, "-c", ENDS.format(seconds)])
     assert (ended.returncode, ended.stderr) == (3, "")
 
 
@@ -78,7 +76,7 @@ def test_results_come_as_they_finish_each_with_its_task():
 def test_items_are_taken_as_processes_become_free():
     taken = []
     results = map_unordered(abs, (taken.append(i) or -i for i in range(9)), 1, died=str, ahead=2)
-    assert next(results) == (0, 0)
+    assert next(results) in {(0, 0), (-1, 1)}  # both may have ended
     assert taken == [0, 1]
     results.close()
     assert sorted(map_unordered(abs, range(-9, 0), 2, died=str)) == [(-i, i) for i in range(9, 0, -1)]

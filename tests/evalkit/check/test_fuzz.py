@@ -41,7 +41,6 @@ fuzz = settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large],
 )
 few = settings(fuzz, max_examples=12)
-pytestmark = pytest.mark.timeout(120)
 
 
 def ascii_ply():

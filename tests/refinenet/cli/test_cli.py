@@ -1,10 +1,10 @@
 import errno
 import shutil
-import subprocess
 import sys
 import threading
 
 import pytest
+from children import run
 from posecore.shard import ShardReader
 from refinenet.config import load_config
 from tensorboard.summary.writer.record_writer import RecordWriter
@@ -145,6 +145,6 @@ def test_two_ranks_train_together(dataset, tmp_path):
         sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "refinenet", "train",
         str(dataset), "--out", str(tmp_path / "run"), *SMALL, "--device", "cpu", "--quiet",
     ]  # fmt: skip
-    result = subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    result = run(command)
     assert result.returncode == 0, result.stderr[-2000:]
     assert (tmp_path / "run" / "last.safetensors").is_file()

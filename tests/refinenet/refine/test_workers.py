@@ -4,11 +4,12 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
+from children import interruptible, started, wait_until
 from posecore.bop import read_sidecar
 
 
@@ -77,41 +78,34 @@ def is_worker(child):
         return False
 
 
+@contextmanager
 def begun(arguments):
     """The command in a process of its own, once both of its workers are there."""
-    command = [sys.executable, "-m", "refinenet", "refine", *map(str, arguments)]
-    process = subprocess.Popen(
-        command,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job inherits it ignored
-    )
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
+    command = [sys.executable, "-m", "refinenet", "refine", *arguments]
+
+    def both():
         workers = [child for child in psutil.Process(process.pid).children() if is_worker(child)]
-        if len(workers) == 2 and not ignores_interrupts(process.pid):
-            return process, workers
-        time.sleep(0.05)
-    process.kill()
-    raise AssertionError("no workers")
+        return len(workers) == 2 and not ignores_interrupts(process.pid) and workers
+
+    with started(command, stderr=subprocess.PIPE, preexec_fn=interruptible) as process:
+        yield process, wait_until(both, process)
 
 
 @pytest.mark.slow
 def test_ctrl_c_and_a_worker_that_dies_end_all_with_one_line(two_images, tmp_path):
     root, start, _ = two_images
     rest = ["--method", "search", "--dataset", root, "--init", start, "--quiet", "--workers", 2, "--out"]
-    process, workers = begun([*rest, tmp_path / "x.csv"])
-    os.killpg(process.pid, signal.SIGINT)  # as a terminal does
-    _, said = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert said.splitlines() == ["Stopped: nothing was finished, nothing is written"]
-    assert psutil.wait_procs(workers, timeout=5)[1] == []
+    with begun([*rest, tmp_path / "x.csv"]) as (process, workers):
+        os.killpg(process.pid, signal.SIGINT)  # as a terminal does
+        _, said = process.communicate()
+        assert process.returncode == 130
+        assert said.splitlines() == ["Stopped: nothing was finished, nothing is written"]
+        psutil.wait_procs(workers)
 
-    process, workers = begun([*rest, tmp_path / "y.csv"])
-    workers[0].kill()
-    _, said = process.communicate(timeout=60)
-    assert process.returncode == 1
-    assert said.splitlines()[-1].startswith(f"Error: {root}: a process that refined its images died")
-    assert "fewer --workers" in said
-    assert psutil.wait_procs(workers, timeout=5)[1] == []
+    with begun([*rest, tmp_path / "y.csv"]) as (process, workers):
+        workers[0].kill()
+        _, said = process.communicate()
+        assert process.returncode == 1
+        assert said.splitlines()[-1].startswith(f"Error: {root}: a process that refined its images died")
+        assert "fewer --workers" in said
+        psutil.wait_procs(workers)

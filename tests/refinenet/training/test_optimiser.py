@@ -1,10 +1,10 @@
 import copy
 import json
-import subprocess
 import sys
 
 import pytest
 import torch
+from children import run
 from refinenet.batch import Batch
 from refinenet.config import OptimiserConfig, load_config
 from refinenet.errors import TrainingError
@@ -121,7 +121,7 @@ def test_a_compiled_network_learns_the_same(dataset, tmp_path):
         options = [*SMALL, "precision=float32", f"compile={flag}"]
         command = [sys.executable, "-m", "refinenet", "train", str(dataset), "--out", str(out), "--quiet"]
         command += [word for option in options for word in ("--set", option)]
-        result = subprocess.run(command, capture_output=True, text=True, timeout=280, check=False)
+        result = run(command)
         assert result.returncode == 0, result.stderr[-2000:]
         curves.append(
             [line["loss_px"] for line in map(json.loads, (out / "metrics.jsonl").open()) if "loss_px" in line]

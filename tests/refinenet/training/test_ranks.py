@@ -1,10 +1,10 @@
 """Training by two processes under torchrun, on this machine, with gloo."""
 
 import json
-import subprocess
 import sys
 
 import pytest
+from children import run
 from refinenet.training.loop import train
 
 from .test_training import SMALL, small
@@ -17,7 +17,7 @@ def torchrun(dataset, out, *arguments):
         sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "-m", "refinenet", "train",
         str(dataset), "--out", str(out), "--device", "cpu", "--quiet", *arguments,
     ]  # fmt: skip
-    return subprocess.run(command, capture_output=True, text=True, timeout=200, check=False)
+    return run(command)
 
 
 def settings(options):

@@ -2,15 +2,14 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from children import started, wait_until
 from posecore.bop import BopDataset
 from posecore.errors import ConfigError, DatasetError, StorageError
 from posecore.mesh import load_mesh
@@ -208,15 +207,9 @@ def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, 
         "write_dataset(sys.argv[2], load_config('default', [*SMALL, *MANY]), meshes, FramePlan(frames=5))\n"
     )
     here, out = str(Path(__file__).parents[1]), tmp_path / "k"
-    process = subprocess.Popen([sys.executable, "-c", script, here, str(out), str(tug_ply), str(bobbin_ply)])
     journal = out / "test/000001/.frames.jsonl"
-    deadline = time.monotonic() + 60
-    while process.poll() is None and time.monotonic() < deadline:
-        if journal.is_file() and journal.stat().st_size:
-            process.kill()
-            break
-        time.sleep(0.002)
-    process.wait()
+    with started([sys.executable, "-c", script, here, out, tug_ply, bobbin_ply]) as process:
+        wait_until(lambda: journal.is_file() and journal.stat().st_size, process)
     assert process.returncode == -signal.SIGKILL, "the run ended before it could be killed"
     (out / "test/000001/rgb/.000003.png.1.tmp").write_bytes(b"half")  # what a kill within a write leaves
     write_dataset(out, config_of(*MANY), meshes, FramePlan(frames=5))

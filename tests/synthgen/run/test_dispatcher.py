@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import children
 import dask
 import numpy as np
 import psutil
@@ -26,7 +27,7 @@ def command(tug_ply, out, small_set, *extra):
 
 
 def run(*arguments, **settings):
-    return subprocess.run(command(*arguments), capture_output=True, text=True, timeout=240, check=False, **settings)
+    return children.run(command(*arguments), **settings)
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -82,18 +83,17 @@ def test_killing_it_at_random_moments_changes_no_byte(reference, tmp_path, tug_p
     killed = 0
     for _ in range(8):
         # its own session, so that the test can see whether workers outlive a killed parent
-        process = subprocess.Popen(arguments, stderr=subprocess.DEVNULL, start_new_session=True)
-        started = time.monotonic()
-        while process.poll() is None and len(list(out.glob("scene_rgb/c/*"))) == 0 and time.monotonic() - started < 60:
-            time.sleep(0.02)
-        time.sleep(rng.uniform(0.0, 0.4))
-        if process.poll() is not None:
-            break
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-        killed += 1
-        _wait_for_group_to_end(process.pid)
-    result = subprocess.run(arguments, capture_output=True, text=True, timeout=240, check=False)
+        with children.started(arguments, stderr=subprocess.DEVNULL) as process:
+            while process.poll() is None and not list(out.glob("scene_rgb/c/*")):
+                time.sleep(0.02)
+            time.sleep(rng.uniform(0.0, 0.4))
+            if process.poll() is not None:
+                break
+            process.kill()
+            process.wait()
+            killed += 1
+            _wait_for_session_to_end(process.pid)
+    result = children.run(arguments)
     assert result.returncode == 0, result.stderr
     assert killed >= 2
     assert finished(out) == tree(reference)
@@ -103,14 +103,12 @@ def test_killing_it_at_random_moments_changes_no_byte(reference, tmp_path, tug_p
 def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set):
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, small_set, "--n", "22", "--workers", "1")
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
-    started = time.monotonic()
-    while not (out / "manifest.jsonl").exists() and time.monotonic() - started < 60:
-        time.sleep(0.01)
-    workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
-    for victim in workers:
-        victim.kill()
-    _, errors = process.communicate(timeout=120)
+    with children.started(arguments, stderr=subprocess.PIPE) as process:
+        children.wait_until((out / "manifest.jsonl").exists, process)
+        workers = [p for p in psutil.Process(process.pid).children() if "spawn_main" in " ".join(p.cmdline())]
+        for victim in workers:
+            victim.kill()
+        _, errors = process.communicate()
     assert workers
     assert process.returncode == 0, errors
     assert tree(out) == tree(reference)
@@ -119,19 +117,11 @@ def test_a_worker_that_dies_is_replaced(reference, tmp_path, tug_ply, small_set)
 @pytest.mark.slow
 def test_ctrl_c_says_how_to_go_on(tmp_path, tug_ply, small_set):
     arguments = command(tug_ply, tmp_path / "shards", small_set, "--n", "4000", "--workers", "1")
-    process = subprocess.Popen(
-        arguments,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a background job inherits it ignored
-    )
-    started = time.monotonic()
-    # until the workers run, the signal is ignored
-    while not (tmp_path / "shards" / "manifest.jsonl").exists() and time.monotonic() - started < 180:
-        time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
-    _, errors = process.communicate(timeout=100)
+    manifest = tmp_path / "shards" / "manifest.jsonl"
+    with children.started(arguments, stderr=subprocess.PIPE, preexec_fn=children.interruptible) as process:
+        children.wait_until(manifest.exists, process)  # until the workers run, the signal is ignored
+        os.killpg(process.pid, signal.SIGINT)
+        _, errors = process.communicate()
     assert process.returncode == 130
     assert "same command again continues" in errors
     assert "Traceback" not in errors
@@ -195,12 +185,7 @@ def test_cycles_makes_the_same_bytes_with_one_and_two_workers(tmp_path, tug_ply,
     assert tree(tmp_path / "1") == tree(tmp_path / "2")
 
 
-def _wait_for_group_to_end(group: int) -> None:
+def _wait_for_session_to_end(leader: int) -> None:
     """Workers notice that their parent is gone and end by themselves."""
-    for _ in range(200):
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.1)
-    raise AssertionError("workers outlived the command by 20 s")
+    while children.session(leader):
+        time.sleep(0.05)

@@ -4,13 +4,13 @@ import json
 import os
 import subprocess
 import sys
-import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
+from children import run, started, wait_until
 from click.testing import CliRunner
 from synthgen.cli import main
 from synthgen.inputs.assets import Assets
@@ -49,7 +49,7 @@ def kill(process):
     for member in family:
         with suppress(psutil.NoSuchProcess):
             member.kill()
-    process.wait(timeout=60)
+    process.wait()
 
 
 class Cluster:
@@ -75,11 +75,9 @@ class Cluster:
         return self.start("worker", "--no-dashboard", *(arguments or ("--nthreads", "1")), **environment)
 
     def wait_for_address(self):
-        for _ in range(600):
-            if self.file.exists() and (text := self.file.read_text()):
-                return json.loads(text)["address"]
-            time.sleep(0.05)
-        raise AssertionError("the scheduler does not start")
+        return json.loads(wait_until(lambda: self.file.exists() and self.file.read_text(), self.processes[0]))[
+            "address"
+        ]
 
     def close(self):
         for process in self.processes:
@@ -100,22 +98,17 @@ def renderers(process):
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_bytes(cluster, tmp_path, tug_ply, small_set):
-    undisturbed = subprocess.run(
-        command(tug_ply, tmp_path / "local", small_set, "--workers", "1"), capture_output=True, text=True, check=False
-    )
+    undisturbed = run(command(tug_ply, tmp_path / "local", small_set, "--workers", "1"))
     assert undisturbed.returncode == 0, undisturbed.stderr
     first, second = cluster.worker(), cluster.worker()
     out = tmp_path / "shards"
-    driver = subprocess.Popen(
-        command(tug_ply, out, small_set, "--scheduler", cluster.address), stderr=subprocess.PIPE, text=True
-    )
-    started = time.monotonic()
-    while not (out / "manifest.jsonl").exists() and driver.poll() is None and time.monotonic() - started < 60:
-        time.sleep(0.01)
-    victims = renderers(first)
-    for victim in victims:
-        victim.kill()
-    _, errors = driver.communicate(timeout=120)
+    arguments = command(tug_ply, out, small_set, "--scheduler", cluster.address)
+    with started(arguments, stderr=subprocess.PIPE) as driver:
+        wait_until((out / "manifest.jsonl").exists, driver)
+        victims = renderers(first)
+        for victim in victims:
+            victim.kill()
+        _, errors = driver.communicate()
     assert victims
     assert driver.returncode == 0, errors
     assert (out / "manifest.jsonl").read_text().count("\n") == 12
@@ -128,12 +121,10 @@ def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path, tug_ply, smal
     cluster.worker()
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, [*small_set, "--n", "900"], "--scheduler", cluster.address)
-    driver = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
-    started = time.monotonic()
-    while not (out / "manifest.jsonl").exists() and driver.poll() is None and time.monotonic() - started < 60:
-        time.sleep(0.01)
-    cluster.processes[0].kill()
-    _, errors = driver.communicate(timeout=120)
+    with started(arguments, stderr=subprocess.PIPE) as driver:
+        wait_until((out / "manifest.jsonl").exists, driver)
+        cluster.processes[0].kill()
+        _, errors = driver.communicate()
     result = subprocess.CompletedProcess(arguments, driver.returncode, "", errors)
     assert "the scheduler is gone; start it and its workers" in error_line(result)
 
@@ -153,7 +144,7 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
         (old.parent, ("has synthgen 0.0.1, the command ",)),
     ):
         process = cluster.worker(PYTHONPATH=str(folder))
-        result = subprocess.run(arguments, capture_output=True, text=True, timeout=100, check=False)
+        result = run(arguments)
         for word in words:
             assert word in error_line(result)
         kill(process)

@@ -1,6 +1,7 @@
 """What goes wrong in workers: crashes, hangs, growth, and scenes that are to blame for it."""
 
 import ctypes
+import faulthandler
 import functools
 import json
 import logging
@@ -11,6 +12,7 @@ from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
 
+import children
 import cloudpickle
 import numpy as np
 import pytest
@@ -50,7 +52,18 @@ class PoisonedRenderer(ShardRenderer):
         if scene_index == FAILURE:
             raise RenderError("Blender failed")
         if scene_index == HANG:
-            ctypes.PyDLL(None).pause()
+            # Its time limit runs out at once; one short enough to wait for would hit other scenes on a busy machine.
+            with Path(os.devnull).open("w") as nowhere:
+                faulthandler.dump_traceback_later(0.2, exit=True, file=nowhere)
+                ctypes.PyDLL(None).pause()
+
+
+HANGS = """
+import ctypes
+from synthgen.run.worker import _killed_after
+with _killed_after(0.2):
+    ctypes.PyDLL(None).pause()
+"""
 
 
 class AllFail(PoisonedRenderer):
@@ -102,7 +115,7 @@ def test_scenes_that_crash_fail_or_hang_are_replaced_and_said(job_and_writer, mo
     job, writer = job_and_writer
     with_renderer(PoisonedRenderer, monkeypatch)
     caplog.set_level(logging.WARNING, "synthgen")
-    run(job, writer, shard_timeout_s=3.0)
+    run(job, writer)
     poisoned = {SEGFAULT, FAILURE, HANG}
     assert writer.quarantined() == sorted(poisoned)
     lines = [json.loads(line) for line in Path(writer.url, "manifest.jsonl").read_text().splitlines()]
@@ -118,6 +131,10 @@ def test_scenes_that_crash_fail_or_hang_are_replaced_and_said(job_and_writer, mo
         assert np.array_equal(found["T_cam_obj"], expected["T_cam_obj"])
         assert np.array_equal(found["scene_rgb"], expected["scene_rgb"])
         assert (found["rejected"].reshape(2, 2) >= np.array(firsts)[:, None]).all()
+
+
+def test_a_process_that_hangs_with_pythons_lock_held_is_killed():
+    assert children.run([sys.executable, "-c", HANGS]).returncode == 1
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from posecore.errors import RenderError
 
 from synthgen.names import GPU_DEVICES, Device
 
-_LISTING_TIMEOUT_S = 180  # the first start on a machine with GPUs may load their drivers
+_LISTING_TIMEOUT_S = 600  # the first start on a machine with GPUs may load their drivers
 
 
 def list_gpus() -> dict[Device, int]:

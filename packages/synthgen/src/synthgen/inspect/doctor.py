@@ -23,7 +23,7 @@ from synthgen.pairs.data_card import versions
 
 State = Literal["ok", "warning", "missing"]
 
-_PROBE_TIMEOUT_S = 120
+_PROBE_TIMEOUT_S = 600
 _GB = 1e9
 _SMALL_SHM_BYTES = 64 * 2**20  # Docker's default
 _PACKAGES = {  # shared libraries that Blender and EGL load, and the Debian packages that hold them

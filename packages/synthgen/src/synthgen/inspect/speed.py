@@ -28,7 +28,7 @@ _MOST_PAIRS = 20_000  # a machine that renders them all while it is measured is 
 _ROOM_BYTES = 400_000  # of free disk for each pair: twice the size of pairs with large patches
 _SHARD_SIZE = 16  # small, so that several are done in seconds
 _STOP_S = 20.0
-_START_S = 180.0  # for workers and engines to start and the first shards to come
+_START_S = 900.0  # for workers and engines to start and the first shards to come, on a busy machine too
 
 
 @dataclass(frozen=True, kw_only=True)

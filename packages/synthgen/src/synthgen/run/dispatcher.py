@@ -41,7 +41,7 @@ _SEARCHES = 5  # fruitless searches in one shard before the run stops
 _DEATHS_IN_A_ROW = 10  # plus four per worker, without a result in between, before the run stops
 _REGISTER_TRIES = 10
 _POLL_S = 5.0  # between counts of the workers
-_LOST_S = 120.0  # without any local worker before the run stops
+_LOST_S = 600.0  # without any local worker before the run stops
 
 
 @dataclass(kw_only=True, eq=False)

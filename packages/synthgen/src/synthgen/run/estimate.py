@@ -18,7 +18,7 @@ from posecore.processes import die_with_parent
 from synthgen.pairs.pair_maker import concatenate
 from synthgen.run.shard_job import ShardJob, ShardRenderer, scenes_in
 
-_START_S = 300.0  # for Blender to start and the first scene to compile its kernels
+_START_S = 900.0  # for Blender to start and the first scene to compile its kernels, on a busy machine too
 _MANIFEST_BYTES = 700  # of a shard's line
 
 
