@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore.errors import DatasetError
-from posecore.files import write_atomic
+from posecore.files import read_regular, write_atomic
 
 LARGEST_INTEGER = 2**63 - 1
 
@@ -24,10 +24,9 @@ def read_json(path: str | Path, kind: type = dict) -> Any:
     """
     file = Path(path)
     try:
-        data = file.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise DatasetError(f"{file}: cannot be read ({reason}); a BOP folder needs this file") from error
+        data = read_regular(file)
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror}); a BOP folder needs this file") from error
     return parse_json(data, str(file), kind)
 
 
