@@ -14,6 +14,7 @@ from posecore.errors import DatasetError
 from posecore.files import read_regular, write_atomic
 
 LARGEST_INTEGER = 2**63 - 1
+_MOST_DIGITS = 40
 
 
 def read_json(path: str | Path, kind: type = dict) -> Any:
@@ -137,6 +138,13 @@ def fraction(entry: Any, key: str, where: str) -> float:
     return min(max(value, 0.0), 1.0)
 
 
+def id_of(text: str) -> int | None:
+    """The id (scene, image or object) that digits mean, such as a ROS stamp's 19; None if they are none of 64 bits."""
+    if not (text.isascii() and text.isdigit()) or len(text) > _MOST_DIGITS or int(text) > LARGEST_INTEGER:
+        return None
+    return int(text)
+
+
 def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """The same mapping with its keys as integers.
 
@@ -145,11 +153,12 @@ def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """
     by_id: dict[int, Any] = {}
     for key, value in content.items():
-        if not (key.isascii() and key.isdigit()) or len(key) > 18:
+        number = id_of(key)
+        if number is None:
             raise DatasetError(f"{file}: a key is not an integer ({shown(key)}), expected image or object ids")
-        if int(key) in by_id:
-            raise DatasetError(f"{file}: two keys mean {int(key)}, such as {shown(key)}; remove one")
-        by_id[int(key)] = value
+        if number in by_id:
+            raise DatasetError(f"{file}: two keys mean {number}, such as {shown(key)}; remove one")
+        by_id[number] = value
     return by_id
 
 
