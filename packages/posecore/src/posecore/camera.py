@@ -11,7 +11,6 @@ from jaxtyping import Float
 from posecore.errors import CameraError
 from posecore.window import Window
 
-
 SMALLEST_FOCAL_PX, LARGEST_PX = 1e-2, 1e7
 """Range of focal lengths and principal points, within which no projection of an object in range overflows."""
 LARGEST_SIDE_PX = 1 << 16
@@ -38,7 +37,7 @@ class Camera:
             raise CameraError(f"camera matrix: found {K.tolist()}, expected a finite 3 x 3 with positive fx and fy")
         if abs(K[0, 1]) > 1e-9 or abs(K[2, 2] - 1.0) > 1e-9:
             raise CameraError(f"camera matrix: found skew {K[0, 1]} and K[2,2] {K[2, 2]}, expected 0 and 1")
-        if not SMALLEST_FOCAL_PX <= min(K[0, 0], K[1, 1]) or np.abs(K).max() > LARGEST_PX:
+        if not min(K[0, 0], K[1, 1]) >= SMALLEST_FOCAL_PX or np.abs(K).max() > LARGEST_PX:
             raise CameraError(
                 f"camera matrix: found {K.tolist()}, expected focal lengths from {SMALLEST_FOCAL_PX:g} px and nothing "
                 f"beyond {LARGEST_PX:g} px"

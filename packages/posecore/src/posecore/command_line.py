@@ -6,7 +6,6 @@ Errors of the project end a command in one line on stderr with an exit code. Log
 import io
 import logging
 import math
-import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import click
 
 from posecore.errors import PoseError, exit_code
+from posecore.text import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -30,26 +30,8 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as of a shell."""
 
 
-_UNPRINTABLE = re.compile("[\x00-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]")
 _LONGEST_LINE = 2000
 _LARGEST_INTEGER = 2**63 - 1
-
-
-def printable(text: str, keep: str = "") -> str:
-    """Text for a terminal: control characters and bytes of names that are not UTF-8 as escapes, such as `\\x1b`.
-
-    Args:
-        text: From anywhere.
-        keep: Characters that stay.
-    """
-    return _UNPRINTABLE.sub(lambda match: match[0] if match[0] in keep else _escaped(match[0]), text)
-
-
-def _escaped(character: str) -> str:
-    code = ord(character)
-    if 0xDC80 <= code <= 0xDCFF:  # a byte of a file name, as Python keeps it
-        code -= 0xDC00
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
 
 
 def error_line(text: object) -> str:

@@ -2,7 +2,6 @@
 
 import json
 import math
-import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from jaxtyping import Float
 
 from posecore.errors import DatasetError
 from posecore.files import read_regular, write_atomic
+from posecore.schema import shown
 
 LARGEST_INTEGER = 2**63 - 1
 _MOST_DIGITS = 40
@@ -74,18 +74,6 @@ def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
 def write_json(path: str | Path, content: Any) -> None:
     """Write JSON atomically, indented by two."""
     write_atomic(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def shown(value: Any) -> str:
-    """A value in an error: one line, and short however large it is."""
-    short = reprlib.Repr()
-    short.maxlist = short.maxdict = 9
-    short.maxstring = short.maxother = 60
-    try:
-        text = short.repr(value)
-    except ValueError:  # a whole number with more digits than the interpreter writes
-        return f"a {type(value).__name__}"
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def numbers(entry: Any, key: str, count: int, where: str) -> Float[np.ndarray, " n"]:

@@ -14,10 +14,11 @@ from jaxtyping import Bool
 
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS
-from posecore.bop.jsonfile import id_of, integer, integer_keys, parse_json, shown
+from posecore.bop.jsonfile import id_of, integer, integer_keys, parse_json
 from posecore.bop.sources import Kind, Layer, MaskKind, some
 from posecore.errors import DatasetError
 from posecore.files import open_regular
+from posecore.schema import shown
 
 BLOCK = 512
 LARGEST_MASK_PX = 1 << 28

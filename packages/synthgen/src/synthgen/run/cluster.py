@@ -18,7 +18,7 @@ from distributed import Client, LocalCluster, Nanny
 from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
 from posecore.errors import ConfigError, RenderError
-from posecore.files import require_regular
+from posecore.files import read_regular
 from posecore.processes import interrupts_ignored
 
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
@@ -72,9 +72,13 @@ class Certificates:
         key = self.key or self.cert
         for option, file in (("--tls-ca", self.ca), ("--tls-cert", self.cert), ("--tls-key", key)):
             try:
-                require_regular(file, _LARGEST_PEM_BYTES)
+                content = read_regular(file, _LARGEST_PEM_BYTES)
             except OSError as error:
                 raise ConfigError(f"{option} {file}: {error.strerror}; give a PEM file") from error
+            if b"ENCRYPTED" in content:
+                raise ConfigError(
+                    f"{option} {file}: has a passphrase, which dask would ask for; give a key without one"
+                )
         security = Security(
             tls_ca_file=str(self.ca), tls_client_cert=str(self.cert), tls_client_key=str(key),
             require_encryption=True,
