@@ -16,6 +16,8 @@ from jaxtyping import Shaped, UInt8
 from posecore.errors import DatasetError, PoseError
 from posecore.files import open_regular, read_regular
 
+cv2.setLogLevel(0)  # it logs what is refused here in one line
+
 LARGEST_IMAGE_PX = 1 << 28
 HEAD_BYTES = 1 << 16
 """Bytes from the start that hold the header of a PNG or JPEG."""
