@@ -33,13 +33,15 @@ WANTED_UNSEEN = {  # declared though no line imports them
     "s3fs",  # fsspec opens s3:// with it
     "onnx",
     "onnxscript",  # torch.onnx.export translates with them
+    "cryptography",  # what dask makes the certificates of local workers with
+    "bokeh",  # what dask draws its dashboard with
     "zarr",  # what others open a dataset with; tests hold our shard files against it
 }
 TEST_TIME_ORACLES = {"timm"}
 ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
     "posecore": (
-        "errors renamed se3 files config processes numba_jit ply symmetry mesh simplify window camera contour raster "
-        "store shard bop html command_line"
+        "errors text schema renamed se3 files image_file config processes numba_jit ply symmetry mesh simplify window "
+        "camera contour raster store shard bop html command_line"
     ),
     "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (

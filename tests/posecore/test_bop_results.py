@@ -250,7 +250,7 @@ def test_another_header_is_refused_by_name(header, message):
         ("1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20-900,-1", "t is '10 20-900'"),
         ("1e0,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "scene_id is '1e0'"),
         ("+1,2,3,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "scene_id is '+1'"),
-        ("1,2,1234567890123456789,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "at most 18 digits"),
+        ("1,2,9223372036854775808,0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "a whole number from 0 to 9223372036854775807"),
         ("1,2,3,0.5 0.5,1 0 0 0 1 0 0 0 1,10 20 900,-1", "score has 2 numbers"),
         ("1,2,3,,1 0 0 0 1 0 0 0 1,10 20 900,-1", "score has 0 numbers"),
         ("1,2,3,0.5,1e200 0 0 0 1e200 0 0 0 1e200,10 20 900,-1", "R is "),
@@ -303,3 +303,12 @@ def test_unknown_ids_are_refused_with_the_first_line(shared_data, tmp_path):
     path.write_text("\n".join([*lines[:300], lines[300].replace(",1.0,", "3,1.0,", 1)]))
     with pytest.raises(ResultFileError, match=r":301: object \d+ is unknown, lmo has 1, 5, 6"):
         read_result_table(path, dataset)
+
+
+@pytest.mark.parametrize("im_id", [1714129813249, 171412981324912345, 1714129813249123450, 2**63 - 1])
+def test_ids_of_64_bits_such_as_ros_stamps_are_read_as_written(tmp_path, im_id):
+    T = np.eye(4)
+    T[2, 3] = 1
+    write_results(tmp_path / "r.csv", [Estimate(scene_id=im_id, im_id=im_id, obj_id=1, T_cam_obj=T)])
+    (read,) = read_results(tmp_path / "r.csv")
+    assert (read.scene_id, read.im_id) == (im_id, im_id)

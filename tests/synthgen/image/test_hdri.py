@@ -154,7 +154,7 @@ def test_exr_is_read_like_hdr(tmp_path):
 def test_a_broken_panorama_is_named(tmp_path, name):
     write_hdr(tmp_path / "good.hdr", 30, 20)
     (tmp_path / name).write_bytes(b"#?RADIANCE\nnot a picture")
-    with pytest.raises(ConfigError, match=rf"{name}: cannot be decoded as an HDRI"):
+    with pytest.raises(ConfigError, match=rf"{name}: cannot be decoded as an (HDRI|image)"):
         hdri.list_hdris(tmp_path)
 
 

@@ -118,7 +118,7 @@ def test_a_broken_panorama_is_one_line(tug_ply, tmp_path):
     arguments = ["render", "--object", tug_ply, "--n", 4, "--out", tmp_path / "out", "--hdris", tmp_path]
     result = CliRunner().invoke(main, [str(a) for a in arguments])
     assert result.exit_code == 2
-    assert "broken.hdr: cannot be decoded as an HDRI" in result.stderr
+    assert "broken.hdr: cannot be decoded as an image" in result.stderr
     assert "Traceback" not in result.output
     assert not (tmp_path / "out").exists()
 

@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,24 +11,17 @@ import psutil
 import pytest
 from children import run, started, wait_until
 from click.testing import CliRunner
+from render_processes import kill
+from render_processes import render_command as command
 from synthgen.cli import main
 from synthgen.inputs.assets import Assets
 from synthgen.run import cluster as dask_cluster
 from synthgen.run import worker
 from synthgen.run.shard_job import ShardJob
 
-N = "46"
-
 
 def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
-
-
-def command(tug_ply, out, small_set, *extra):
-    return [
-        *(sys.executable, "-m", "synthgen.cli", "render", "--object", str(tug_ply), "--out", str(out), "--quiet"),
-        *("--n", N, *small_set, *extra),
-    ]
 
 
 def error_line(result):
@@ -38,18 +30,6 @@ def error_line(result):
     assert len(lines) == 1, result.stderr
     assert "Traceback" not in result.stderr
     return lines[0]
-
-
-def kill(process):
-    """End a process and what it started."""
-    try:
-        family = [*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)]
-    except psutil.NoSuchProcess:  # it has ended, and was waited for
-        return
-    for member in family:
-        with suppress(psutil.NoSuchProcess):
-            member.kill()
-    process.wait()
 
 
 class Cluster:

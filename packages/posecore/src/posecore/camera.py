@@ -11,6 +11,10 @@ from jaxtyping import Float
 from posecore.errors import CameraError
 from posecore.window import Window
 
+SMALLEST_FOCAL_PX, LARGEST_PX = 1e-2, 1e7
+"""Range of focal lengths and principal points, within which no projection of an object in range overflows."""
+LARGEST_SIDE_PX = 1 << 16
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Camera:
@@ -33,8 +37,15 @@ class Camera:
             raise CameraError(f"camera matrix: found {K.tolist()}, expected a finite 3 x 3 with positive fx and fy")
         if abs(K[0, 1]) > 1e-9 or abs(K[2, 2] - 1.0) > 1e-9:
             raise CameraError(f"camera matrix: found skew {K[0, 1]} and K[2,2] {K[2, 2]}, expected 0 and 1")
-        if self.width_px < 1 or self.height_px < 1:
-            raise CameraError(f"image size: found {self.width_px} x {self.height_px} px, expected at least 1 x 1")
+        if not min(K[0, 0], K[1, 1]) >= SMALLEST_FOCAL_PX or np.abs(K).max() > LARGEST_PX:
+            raise CameraError(
+                f"camera matrix: found {K.tolist()}, expected focal lengths from {SMALLEST_FOCAL_PX:g} px and nothing "
+                f"beyond {LARGEST_PX:g} px"
+            )
+        if not (1 <= self.width_px <= LARGEST_SIDE_PX and 1 <= self.height_px <= LARGEST_SIDE_PX):
+            raise CameraError(
+                f"image size: found {self.width_px} x {self.height_px} px, expected sides of 1 to {LARGEST_SIDE_PX}"
+            )
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> Float[np.ndarray, "3 3"]:

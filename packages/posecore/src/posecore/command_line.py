@@ -3,7 +3,9 @@
 Errors of the project end a command in one line on stderr with an exit code. Logging and progress go to stderr too.
 """
 
+import io
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import click
 
 from posecore.errors import PoseError, exit_code
+from posecore.text import printable
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -27,28 +30,100 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as of a shell."""
 
 
+_LONGEST_LINE = 2000
+_LARGEST_INTEGER = 2**63 - 1
+
+
+def error_line(text: object) -> str:
+    """An error in one printable line of limited length."""
+    line = printable(f"Error: {text}")
+    return line if len(line) <= _LONGEST_LINE else f"{line[:_LONGEST_LINE]}..."
+
+
 class ErrorReportingGroup(click.Group):
-    """Group that reports `PoseError` and `OSError` in one line on stderr with an exit code, without a traceback."""
+    """Group that reports bad input in one line on stderr with an exit code, without a traceback.
+
+    That is `PoseError`, `OSError`, and option values that no command takes: empty ones, and numbers that are not finite
+    or do not fit 64 bits.
+    """
+
+    def make_context(self, *arguments: Any, **settings: Any) -> click.Context:
+        """Parse the options of the group."""
+        with _printable_usage_errors():
+            return super().make_context(*arguments, **settings)
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Add a command; its numbers are checked."""
+        for parameter in cmd.params:
+            parameter.callback = _checked(parameter.callback)
+        super().add_command(cmd, name)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Find the command; an empty argument is refused, of which a path would make the working folder."""
+        name, command, rest = super().resolve_command(ctx, args)
+        for before, argument in zip(["", *rest], rest, strict=False):
+            option, _, value = argument.partition("=")
+            if not argument or (option.startswith("--") and argument != option and not value):
+                what = option or (before if before.startswith("-") else "an argument")
+                raise click.UsageError(f"{what}: the value is empty, expected one; leave it out for the default", ctx)
+        return name, command, rest
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
+        if isinstance(sys.stdout, io.TextIOWrapper):  # a name that is not UTF-8 is printed with escapes
+            sys.stdout.reconfigure(errors="backslashreplace")
         try:
-            return super().invoke(ctx)
+            with _printable_usage_errors():
+                return super().invoke(ctx)
         except PoseError as error:
-            click.echo(f"Error: {error}", err=True)
+            click.echo(error_line(error), err=True)
             ctx.exit(exit_code(error))
         except BrokenPipeError:  # `| head` has read enough: click ends quietly
             raise
         except OSError as error:
             from posecore.files import storage_error
 
-            click.echo(f"Error: {storage_error(error.filename or 'storage', error)}", err=True)
+            click.echo(error_line(storage_error(error.filename or "storage", error)), err=True)
             ctx.exit(1)
+
+
+@contextmanager
+def _printable_usage_errors() -> Iterator[None]:
+    try:
+        yield
+    except click.ClickException as error:
+        error.message = printable(error.message, keep="\n\t")
+        if len(error.message) > _LONGEST_LINE:
+            error.message = f"{error.message[:_LONGEST_LINE]}..."
+        raise
+
+
+def _checked(callback: Callable[..., Any] | None) -> Callable[..., Any]:
+    """A parameter's callback that refuses numbers no command takes, then calls the original."""
+
+    def check(ctx: click.Context, parameter: click.Parameter, value: Any) -> Any:
+        for item in value if isinstance(value, tuple | list) else (value,):
+            if isinstance(item, float) and not math.isfinite(item):
+                raise click.BadParameter(f"found {item}, expected a finite number", ctx, parameter)
+            if isinstance(item, int) and abs(item) > _LARGEST_INTEGER:
+                raise click.BadParameter("the number has more than 64 bits, expected a smaller one", ctx, parameter)
+        return value if callback is None else callback(ctx, parameter, value)
+
+    return check
+
+
+class _PrintableFormatter(logging.Formatter):
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return printable(super().formatMessage(record))
 
 
 def start_logging(package: str, verbose: bool) -> None:
     """Log to stderr: warnings; of this package and posecore also details if `verbose`."""
-    logging.basicConfig(format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr)
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(_PrintableFormatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(handlers=[handler])
     for name in (package, "posecore"):
         logging.getLogger(name).setLevel(logging.INFO if verbose else logging.WARNING)
 
@@ -102,7 +177,7 @@ def end_early(stopped: BaseException, kept: str | None) -> NoReturn:
     """End an interruption with exit code 130, or with the error; one line before names what was kept, if anything."""
     is_interrupted = isinstance(stopped, KeyboardInterrupt)
     if kept is not None or is_interrupted:
-        click.echo(f"Stopped: {kept or 'nothing was finished, nothing is written'}", err=True)
+        click.echo(printable(f"Stopped: {kept or 'nothing was finished, nothing is written'}"), err=True)
     if is_interrupted:
         raise SystemExit(INTERRUPTED) from None
     raise stopped

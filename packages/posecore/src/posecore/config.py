@@ -14,6 +14,7 @@ Ranges stand beside the fields:
 """
 
 import dataclasses
+import itertools
 import math
 import types
 import typing
@@ -24,9 +25,12 @@ from typing import Any, TypeVar
 import yaml
 
 from posecore.errors import ConfigError
+from posecore.files import read_regular
 from posecore.renamed import refuse_renamed_keys
 
 T = TypeVar("T")
+LARGEST_YAML_BYTES = 1 << 20
+MOST_YAML_VALUES = 100_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,23 +112,43 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     """Read a YAML mapping.
 
     Raises:
-        ConfigError: Missing file, invalid YAML (with its line), or not a mapping.
+        ConfigError: Missing file, invalid YAML (with its line), not a mapping, or nested or repeated without end.
     """
     file = Path(path)
     try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+        text = read_regular(file, LARGEST_YAML_BYTES).decode("utf-8")
     except OSError as error:
         raise ConfigError(f"{file}: cannot be read ({error.strerror}); give the path of a YAML file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "not UTF-8 text"
-        raise ConfigError(f"{file}{where}: invalid YAML ({problem})") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: invalid YAML (not UTF-8 text)") from error
+    content = _parse_yaml(text, str(file))
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(f"{file}: found a {type(content).__name__}, expected a mapping of keys")
     return content
+
+
+def _parse_yaml(text: str, where: str) -> Any:
+    try:
+        content = yaml.safe_load(text)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark
+        line = f", line {mark.line + 1}" if mark and "\n" in text else ""
+        raise ConfigError(f"{where}{line}: invalid YAML ({error.problem})") from error
+    except RecursionError as error:
+        raise ConfigError(f"{where}: invalid YAML (brackets are nested too deep)") from error
+    except (yaml.YAMLError, ValueError) as error:  # a control character; a date such as 2026-99-99
+        raise ConfigError(f"{where}: invalid YAML ({str(error).splitlines()[0]})") from error
+    left = [content]
+    for count in itertools.count():  # aliases are cheap to parse, and endless to walk
+        if not left:
+            return content
+        if count > MOST_YAML_VALUES:
+            raise ConfigError(f"{where}: more than {MOST_YAML_VALUES} values, aliases counted each time")
+        value = left.pop()
+        left += value.values() if isinstance(value, dict) else value if isinstance(value, list | set) else ()
+    raise AssertionError("the count has no end")
 
 
 def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
@@ -138,10 +162,7 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
         key, equals, text = assignment.partition("=")
         if not equals or not key:
             raise ConfigError(f"--set {assignment}: expected key=value, for example --set patch_px=128")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {assignment}: the value is not valid YAML") from error
+        value = _parse_yaml(text, f"--set {assignment}")
         *groups, leaf = key.split(".")
         target = result
         for group in groups:

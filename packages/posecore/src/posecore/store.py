@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from posecore.errors import ConfigError, StorageError
-from posecore.files import storage_error, write_atomic
+from posecore.files import read_regular, storage_error, write_atomic
 
 
 @runtime_checkable
@@ -35,7 +35,7 @@ class LocalStore:
     def get(self, key: str) -> bytes | None:
         """Bytes of a file, None when it is absent."""
         try:
-            return (self.root / key).read_bytes()
+            return read_regular(self.root / key)
         except (FileNotFoundError, NotADirectoryError, IsADirectoryError):
             return None
         except OSError as error:

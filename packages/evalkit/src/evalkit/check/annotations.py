@@ -10,11 +10,12 @@ from jaxtyping import Float
 from posecore import se3
 from posecore.bop import BopDataset, GroundTruth, ModelInfo
 from posecore.bop.annotations import camera_matrix, depth_scale, ground_truth, visib_fract
-from posecore.bop.jsonfile import numbers, shown
+from posecore.bop.jsonfile import numbers
 from posecore.bop.models_info import MM
 from posecore.bop.results import SUSPICIOUS_DISTANCE_MM
 from posecore.bop.sources import Kind, scenes_of
 from posecore.errors import DatasetError
+from posecore.schema import shown
 
 from evalkit.check.findings import Findings, Level
 

@@ -1,6 +1,7 @@
 """The two files of a comparison: BOP result files, or error tables (`estimates.csv`) of `evalkit report`."""
 
 import csv
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -9,12 +10,13 @@ from pathlib import Path
 import pandas as pd
 from posecore.bop import BopDataset
 from posecore.errors import ConfigError, ResultFileError
-from posecore.files import sha256_file
+from posecore.files import open_regular, read_regular, sha256_file
 
 from evalkit.error_table import COLUMNS, RENAMED_COLUMNS
 from evalkit.evaluation.evaluator import Evaluator, VssKind
 from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.result_files import dataset_of, load_result_files
+from evalkit.tables.csv_cells import unescaped
 
 NAMES_COLUMN = "results"
 """Column of an error table with the result file's name."""
@@ -114,8 +116,8 @@ def is_error_table(path: Path) -> bool:
         ResultFileError: the file cannot be read.
     """
     try:
-        with path.open(encoding="utf-8-sig", errors="replace") as stream:
-            head = stream.readline(10_000)
+        with open_regular(path) as stream:
+            head = stream.readline(10_000).decode("utf-8-sig", "replace")
     except OSError as error:
         raise ResultFileError(
             f"{path}: cannot be read ({error.strerror}); give a BOP result file or a report's estimates.csv"
@@ -135,7 +137,7 @@ def read_errors(path: Path, name: str | None = None) -> Side:
         ConfigError: the table holds several result files and `name` is None or none of their names.
     """
     rows = _rows(path)
-    named = rows[NAMES_COLUMN] if NAMES_COLUMN in rows else pd.Series(path.stem, index=rows.index)
+    named = rows[NAMES_COLUMN].map(unescaped) if NAMES_COLUMN in rows else pd.Series(path.stem, index=rows.index)
     names = list(dict.fromkeys(named))
     if name is None and len(names) > 1:
         raise ConfigError(f"{path}: holds {', '.join(names)}; name one with --result-a and --result-b")
@@ -152,8 +154,8 @@ def read_errors(path: Path, name: str | None = None) -> Side:
 
 def _rows(path: Path) -> pd.DataFrame:
     try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            lines = list(csv.reader(stream))
+        text = read_regular(path).decode("utf-8-sig")
+        lines = list(csv.reader(io.StringIO(text, newline="")))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ResultFileError(f"{path}: cannot be read as CSV ({error})") from error
     head = [RENAMED_COLUMNS.get(name, name) for name in map(str.strip, lines[0])]

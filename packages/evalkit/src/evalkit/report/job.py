@@ -15,6 +15,7 @@ from evalkit.evaluation.scored_file import Scored, score_file
 from evalkit.inputs.result_files import load_result_files, open_dataset
 from evalkit.report.page import report_page
 from evalkit.report.summary import summarise
+from evalkit.tables.csv_cells import escaped
 from evalkit.tables.report_tables import report_tables
 from evalkit.tables.writers import write_tables
 
@@ -94,7 +95,7 @@ def estimates_csv(scored: Sequence[Scored]) -> str:
     for item in scored:
         part = item.table.copy()
         part[["found", "symmetric"]] = part[["found", "symmetric"]].astype("int64")
-        part.insert(0, "results", item.file.name)
+        part.insert(0, "results", escaped(item.file.name))
         parts.append(part)
     text: str = pd.concat(parts).to_csv(index=False, lineterminator="\n", float_format="%.9g")
     return text

@@ -11,6 +11,7 @@ from typing import Any
 from posecore.errors import ConfigError
 from posecore.files import write_atomic
 
+from evalkit.tables.csv_cells import escaped
 from evalkit.tables.latex import latex
 from evalkit.tables.markdown import markdown
 from evalkit.tables.model import Cell, Interval, Table
@@ -50,7 +51,7 @@ def csv_text(table: Table) -> str:
 
 def _plain(value: float | int | str | None) -> str:
     if value is None or isinstance(value, str):
-        return value or ""
+        return escaped(value or "")
     return "" if math.isnan(value) else f"{value:.9g}" if isinstance(value, float) else str(value)
 
 

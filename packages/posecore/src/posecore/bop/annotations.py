@@ -7,9 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore import se3
-from posecore.bop.jsonfile import fraction, integer, numbers, shown
+from posecore.bop.jsonfile import fraction, integer, numbers
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import DatasetError
+from posecore.schema import shown
 
 NO_POSE_MM = -1.0
 LARGEST_T_MM = 1e9

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from posecore.errors import DatasetError
+from posecore.files import LARGEST_FILE_BYTES, open_regular
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,7 +39,7 @@ class StoredFile:
         """
         size = self.size if limit is None or (self.size is not None and self.size < limit) else limit
         try:
-            with self.path.open("rb") as stream:
+            with open_regular(self.path, LARGEST_FILE_BYTES if size is None else None) as stream:
                 stream.seek(self.offset)
                 data = stream.read() if size is None else stream.read(size)
         except (OSError, ValueError) as error:

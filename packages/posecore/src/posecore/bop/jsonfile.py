@@ -2,7 +2,6 @@
 
 import json
 import math
-import reprlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore.errors import DatasetError
-from posecore.files import write_atomic
+from posecore.files import read_regular, write_atomic
+from posecore.schema import shown
 
 LARGEST_INTEGER = 2**63 - 1
+_MOST_DIGITS = 40
 
 
 def read_json(path: str | Path, kind: type = dict) -> Any:
@@ -24,10 +25,9 @@ def read_json(path: str | Path, kind: type = dict) -> Any:
     """
     file = Path(path)
     try:
-        data = file.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise DatasetError(f"{file}: cannot be read ({reason}); a BOP folder needs this file") from error
+        data = read_regular(file)
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot be read ({error.strerror}); a BOP folder needs this file") from error
     return parse_json(data, str(file), kind)
 
 
@@ -74,18 +74,6 @@ def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
 def write_json(path: str | Path, content: Any) -> None:
     """Write JSON atomically, indented by two."""
     write_atomic(path, (json.dumps(content, indent=2) + "\n").encode())
-
-
-def shown(value: Any) -> str:
-    """A value in an error: one line, and short however large it is."""
-    short = reprlib.Repr()
-    short.maxlist = short.maxdict = 9
-    short.maxstring = short.maxother = 60
-    try:
-        text = short.repr(value)
-    except ValueError:  # a whole number with more digits than the interpreter writes
-        return f"a {type(value).__name__}"
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def numbers(entry: Any, key: str, count: int, where: str) -> Float[np.ndarray, " n"]:
@@ -138,6 +126,13 @@ def fraction(entry: Any, key: str, where: str) -> float:
     return min(max(value, 0.0), 1.0)
 
 
+def id_of(text: str) -> int | None:
+    """The id (scene, image or object) that digits mean, such as a ROS stamp's 19; None if they are none of 64 bits."""
+    if not (text.isascii() and text.isdigit()) or len(text) > _MOST_DIGITS or int(text) > LARGEST_INTEGER:
+        return None
+    return int(text)
+
+
 def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """The same mapping with its keys as integers.
 
@@ -146,11 +141,12 @@ def integer_keys(content: dict[str, Any], file: str | Path) -> dict[int, Any]:
     """
     by_id: dict[int, Any] = {}
     for key, value in content.items():
-        if not (key.isascii() and key.isdigit()) or len(key) > 18:
+        number = id_of(key)
+        if number is None:
             raise DatasetError(f"{file}: a key is not an integer ({shown(key)}), expected image or object ids")
-        if int(key) in by_id:
-            raise DatasetError(f"{file}: two keys mean {int(key)}, such as {shown(key)}; remove one")
-        by_id[int(key)] = value
+        if number in by_id:
+            raise DatasetError(f"{file}: two keys mean {number}, such as {shown(key)}; remove one")
+        by_id[number] = value
     return by_id
 
 

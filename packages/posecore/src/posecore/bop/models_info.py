@@ -8,9 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from posecore import se3
-from posecore.bop.jsonfile import as_list, integer_keys, numbers, read_json, shown, write_json
+from posecore.bop.jsonfile import as_list, integer_keys, numbers, read_json, write_json
 from posecore.errors import DatasetError
 from posecore.mesh import Mesh
+from posecore.schema import shown
 from posecore.symmetry import ContinuousSymmetry, symmetry_transforms
 
 __all__ = [

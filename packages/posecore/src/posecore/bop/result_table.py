@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from posecore import se3
+from posecore.bop.jsonfile import LARGEST_INTEGER, id_of
 from posecore.bop.models_info import MM, ROTATION_TOLERANCE
 from posecore.errors import ResultFileError
 
@@ -260,12 +261,10 @@ def _line_by_line(
 
 
 def _id(text: str, column: str) -> int:
-    digits = text.strip()
-    if not (digits.isascii() and digits.isdigit()):
-        raise ResultFileError(f"{column} is '{_short(text)}', expected a whole number")
-    if len(digits) > 18:
-        raise ResultFileError(f"{column} is '{_short(text)}', expected a whole number of at most 18 digits")
-    return int(digits)
+    number = id_of(text.strip())
+    if number is None:
+        raise ResultFileError(f"{column} is '{_short(text)}', expected a whole number from 0 to {LARGEST_INTEGER}")
+    return number
 
 
 def _floats(text: str, count: int, column: str) -> list[float]:

@@ -14,7 +14,7 @@ from posecore.bop.jsonfile import read_json
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
 from posecore.errors import ResultFileError
-from posecore.files import write_atomic
+from posecore.files import read_regular, write_atomic
 from posecore.renamed import migrated_keys
 
 __all__ = [
@@ -118,7 +118,7 @@ def read_result_bytes(file: Path) -> bytes:
         ResultFileError: it cannot be read.
     """
     try:
-        return file.read_bytes()
+        return read_regular(file)
     except OSError as error:
         raise ResultFileError(f"{file}: cannot be read ({error.strerror}); give a BOP result file (CSV)") from error
 

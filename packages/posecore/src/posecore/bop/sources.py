@@ -12,7 +12,7 @@ from jaxtyping import Bool
 
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS, find_image, read_mask
-from posecore.bop.jsonfile import integer_keys, parse_json
+from posecore.bop.jsonfile import id_of, integer_keys, parse_json
 from posecore.errors import DatasetError
 
 Kind = Literal["camera", "gt", "gt_info"]
@@ -202,7 +202,7 @@ def scene_folders(split_path: Path) -> list[Path]:
         names = sorted(entry.name for entry in os.scandir(split_path) if entry.is_dir())
     except (OSError, ValueError):
         return []
-    return [split_path / name for name in names if name.isascii() and name.isdigit() and len(name) <= 18]
+    return [split_path / name for name in names if id_of(name) is not None]
 
 
 def _sensors_of(scene: Path) -> frozenset[str]:

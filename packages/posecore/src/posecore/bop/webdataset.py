@@ -14,13 +14,15 @@ from jaxtyping import Bool
 
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS
-from posecore.bop.jsonfile import integer, integer_keys, parse_json, shown
+from posecore.bop.jsonfile import id_of, integer, integer_keys, parse_json
 from posecore.bop.sources import Kind, Layer, MaskKind, some
 from posecore.errors import DatasetError
+from posecore.files import open_regular
+from posecore.schema import shown
 
 BLOCK = 512
 LARGEST_MASK_PX = 1 << 28
-_KEY = re.compile(r"([0-9]{1,18})_([0-9]{1,18})")
+_KEY = re.compile(r"([0-9]+)_([0-9]+)")
 _Member = tuple[int, str, int, int]  # shard, member's name, offset, size
 
 
@@ -52,11 +54,12 @@ class ShardSource:
     def _add(self, shard: int, name: str, offset: int, size: int) -> None:
         key, _, extension = name.rsplit("/", 1)[-1].partition(".")
         match = _KEY.fullmatch(key)
-        if match is None:
+        scene_id, im_id = (None, None) if match is None else map(id_of, match.groups())
+        if scene_id is None or im_id is None:
             if extension == "camera.json":
                 raise DatasetError(f"{self.shards[shard]}:{name}: its key is not SCENE_IMAGE, such as 000001_000023")
             return
-        image = self._index.setdefault(int(match[1]), {}).setdefault(int(match[2]), {})
+        image = self._index.setdefault(scene_id, {}).setdefault(im_id, {})
         if extension in image:
             other = image[extension]
             raise DatasetError(
@@ -154,7 +157,7 @@ def _members(shard: Path) -> Iterator[tuple[str, int, int]]:
     advice = "copy it again (shards are uncompressed tar files)"
     try:
         size = shard.stat().st_size
-        with tarfile.open(shard, "r:") as tar:
+        with open_regular(shard, None) as stream, tarfile.open(fileobj=stream, mode="r:") as tar:
             for member in tar:
                 if member.offset_data + member.size > size:
                     raise DatasetError(f"{shard}:{member.name}: reaches beyond the file's end, it is cut off; {advice}")

@@ -18,7 +18,7 @@ from posecore.bop.jsonfile import as_list, integer_keys, read_json, write_json
 from posecore.bop.models_info import MM, ModelInfo, save_models_info
 from posecore.camera import Camera
 from posecore.errors import DatasetError
-from posecore.files import storage_error, write_atomic
+from posecore.files import read_regular, storage_error, write_atomic
 from posecore.mesh import Mesh, save_ply
 
 SCENE_FILES = ("scene_gt_info.json", "scene_camera.json", "scene_gt.json")
@@ -190,7 +190,7 @@ class BopWriter:
     def _noted(self) -> dict[int, tuple[str, ...]]:
         """The journal's frames; a partial last line is truncated."""
         try:
-            data = self._journal.read_bytes() if self._journal.is_file() else b""
+            data = read_regular(self._journal) if self._journal.is_file() else b""
             whole = data[: data.rfind(b"\n") + 1]
             if len(whole) < len(data):
                 os.truncate(self._journal, len(whole))

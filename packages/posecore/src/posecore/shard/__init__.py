@@ -7,7 +7,7 @@ last. The group's attributes are the data card. Fields come from `data_specs/sha
 
 from posecore.shard.fields import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, Field, field_table, schema
 from posecore.shard.layout import GROUP, MANIFEST, n_shards, samples_in
-from posecore.shard.objects import load_meshes
+from posecore.shard.objects import MODELS_INFO, load_meshes, model_keys
 from posecore.shard.reader import ShardReader
 from posecore.shard.writer import Encoded, ShardWriter, encode
 
@@ -17,6 +17,7 @@ __all__ = [
     "BIT_VISIBLE",
     "GROUP",
     "MANIFEST",
+    "MODELS_INFO",
     "Encoded",
     "Field",
     "ShardReader",
@@ -24,6 +25,7 @@ __all__ = [
     "encode",
     "field_table",
     "load_meshes",
+    "model_keys",
     "n_shards",
     "samples_in",
     "schema",

@@ -69,7 +69,12 @@ class Field:
         if self.squared:
             return self._square(values)
         if step is None:
-            return np.asarray(values, self.dtype)
+            exact = np.asarray(values, self.dtype)
+            if exact.dtype.kind in "iu" and exact.dtype != np.asarray(values).dtype and (exact != values).any():
+                raise ShardError(
+                    f"{self.name}: values from {np.min(values)} to {np.max(values)} do not fit {self.dtype}"
+                )
+            return exact
         stored = np.rint(np.multiply(values, np.float32(1 / step), dtype=np.float32))
         limit = int(np.iinfo(self.dtype).max)
         if not stored.min() >= 0 or not stored.max() <= limit:  # NaN fails both

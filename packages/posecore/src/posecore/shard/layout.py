@@ -5,7 +5,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from posecore.errors import ShardError
+from posecore.schema import check, parse_json
 from posecore.shard import sharding_codec
+from posecore.shard.card_schema import ADVICE, ManifestLine, check_card
 from posecore.shard.fields import Field, field_table, schema
 from posecore.store import Store
 
@@ -80,14 +82,13 @@ def read_card(url: str, group: bytes) -> dict[str, Any]:
     """The data card of a group's metadata.
 
     Raises:
-        ShardError: It is none, or of another schema.
+        ShardError: It is none, of another schema, or has a value out of bounds.
     """
-    try:
-        card = dict(json.loads(group)["attributes"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise ShardError(
-            f"{url}/{GROUP}: not the metadata of a Zarr v3 group; the dataset is damaged, delete it and render it again"
-        ) from error
+    where = f"{url}/{GROUP}"
+    content = parse_json(group, where, ShardError, ADVICE)
+    card = content.get("attributes") if isinstance(content, dict) else None
+    if not isinstance(card, dict):
+        raise ShardError(f"{where}: not the metadata of a Zarr v3 group; {ADVICE}")
     name, version = schema()
     stored = (card.get("schema"), card.get("schema_version"))
     if stored != (name, version):
@@ -95,29 +96,40 @@ def read_card(url: str, group: bytes) -> dict[str, Any]:
             f"{url}: schema {stored[0]} version {stored[1]}, expected {name} version {version}; "
             "render the dataset again with this version, or use the version that made it"
         )
+    check_card(card, where)
     return card
 
 
-def read_manifest(url: str, store: Store) -> list[dict[str, Any]]:
+def read_manifest(url: str, store: Store, card: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The manifest's lines in their order. See `parse_manifest`."""
-    return parse_manifest(url, store.get(MANIFEST) or b"")
+    return parse_manifest(url, store.get(MANIFEST) or b"", card)
 
 
-def parse_manifest(url: str, data: bytes) -> list[dict[str, Any]]:
+def parse_manifest(url: str, data: bytes, card: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The lines of a manifest's content.
 
+    Args:
+        url: Dataset, for messages.
+        data: The manifest.
+        card: Data card of the dataset.
+
     Raises:
-        ShardError: A line is broken.
+        ShardError: A line is broken, or of a shard that the dataset does not have or that an earlier line is of.
     """
-    lines = []
-    for number, text in enumerate(data.decode("utf-8", "replace").splitlines(), start=1):
-        try:
-            line = json.loads(text)
-            lines.append({**line, "shard": int(line["shard"]), "bytes": dict(line["bytes"])})
-        except (ValueError, KeyError, TypeError) as error:
+    lines: list[dict[str, Any]] = []
+    seen: set[int] = set()
+    advice = "delete the line and render again"
+    for number, text in enumerate(data.splitlines(), start=1):
+        where = f"{url}/{MANIFEST}, line {number}"
+        line = parse_json(text, where, ShardError, advice)
+        check(line, ManifestLine, where, ShardError, advice)
+        if line["shard"] in seen or line["shard"] >= n_shards(card):
             raise ShardError(
-                f"{url}/{MANIFEST}, line {number}: not a shard's JSON record; delete the line and render again"
-            ) from error
+                f"{where}: shard {line['shard']} is listed twice, or beyond the {n_shards(card)} shards of the data "
+                f"card; {advice}"
+            )
+        seen.add(line["shard"])
+        lines.append(line)
     return lines
 
 

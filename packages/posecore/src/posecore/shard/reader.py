@@ -21,6 +21,7 @@ from posecore.shard.layout import (
     samples_in,
     shard_key,
 )
+from posecore.shard.sample_checks import first_fault
 from posecore.store import open_store
 
 
@@ -45,7 +46,7 @@ class ShardReader:
 
     def refresh(self) -> None:
         """Read the manifest again: a dataset may grow while it is read."""
-        self._lines = {line["shard"]: line for line in read_manifest(self.url, self._store)}
+        self._lines = {line["shard"]: line for line in read_manifest(self.url, self._store, self.card)}
 
     @property
     def n(self) -> int:
@@ -75,6 +76,16 @@ class ShardReader:
     def n_samples(self, shard_id: int) -> int:
         """Samples in a shard."""
         return samples_in(self.card, shard_id)
+
+    def require(self, *keys: str) -> None:
+        """Require entries of the data card that all datasets of `synthgen` have.
+
+        Raises:
+            ShardError: One is missing.
+        """
+        missing = [key for key in keys if key not in self.card]
+        if missing:
+            raise ShardError(f"{self.url}: the data card has no {missing[0]}; make it with `synthgen render` or `cut`")
 
     @cached_property
     def digest(self) -> str:
@@ -116,6 +127,22 @@ class ShardReader:
         if fields is None and digest.hexdigest() != line.get("sha256"):
             first = shard_key(next(iter(table.values())), shard_id)
             raise self._changed(first, f"shard {shard_id} differs from its checksum in {MANIFEST}")
+        return values
+
+    def read_checked(self, shard_id: int, fields: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+        """As `read`; every sample can be used: finite numbers, poses, cameras, objects of the data card.
+
+        Raises:
+            ShardError: As `read`, or a sample cannot be used; the message names it.
+        """
+        values = self.read(shard_id, fields)
+        fault = first_fault(values, {int(key) for key in self.card["objects"]} if "objects" in self.card else None)
+        if fault is not None:
+            row, reason = fault
+            raise ShardError(
+                f"{self.url}: shard {shard_id}, sample {shard_id * self.shard_size + row}: {reason}; delete a file of "
+                "this shard and run the same `synthgen render` or `synthgen cut` again, or make the dataset anew"
+            )
         return values
 
     def _field_bytes(self, field: Field, shard_id: int, line: Mapping[str, Any]) -> bytes:

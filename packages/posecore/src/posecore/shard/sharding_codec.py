@@ -25,6 +25,7 @@ MOST_CHUNK_SAMPLES = 8
 _ABSENT = np.uint64(2**64 - 1)
 _CRC_BYTES = 4
 _ZSTD_LEVEL, _BLOSC_LEVEL = 1, 3
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _BLOSC_SETTING = threading.Lock()
 
 
@@ -130,6 +131,9 @@ def _compress(values: np.ndarray, codec: str) -> bytes:
 
 def _decompress(data: memoryview, codec: str, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
     flat = np.empty(int(np.prod(shape)), dtype)
+    size = (_blosc_size if "shuffle" in codec else _zstd_size)(data)
+    if size != flat.nbytes:  # a shorter chunk would leave the rest of `flat` as it was in memory
+        raise ValueError(f"a chunk holds {size} bytes, expected {flat.nbytes}")
     (blosc if "shuffle" in codec else zstd).decompress(data, flat.view(np.uint8))
     if "delta" in codec:
         flat = np.cumsum(flat, dtype=dtype)
@@ -139,6 +143,24 @@ def _decompress(data: memoryview, codec: str, dtype: np.dtype, shape: tuple[int,
     for image, planes in zip(images, flat.reshape(shape[0], shape[-1], *shape[1:-1]), strict=True):
         cv2.merge(list(planes), dst=image)
     return images
+
+
+def _blosc_size(data: memoryview) -> int:
+    """Bytes of a chunk when decompressed, from Blosc's header."""
+    return int.from_bytes(data[4:8], "little")
+
+
+def _zstd_size(data: memoryview) -> int | None:
+    """Bytes of a chunk when decompressed, from zstd's frame header (RFC 8878, 3.1.1.1); None where it has none."""
+    if len(data) < 5 or bytes(data[:4]) != _ZSTD_MAGIC:
+        raise ValueError("not zstd")
+    descriptor = data[4]
+    is_single_segment = bool(descriptor & 0x20)
+    start = 5 + (not is_single_segment) + (0, 1, 2, 4)[descriptor & 3]
+    length = (int(is_single_segment), 2, 4, 8)[descriptor >> 6]
+    if not length:
+        return None
+    return int.from_bytes(data[start : start + length], "little") + (256 if length == 2 else 0)
 
 
 def _with_crc(data: bytes) -> bytes:

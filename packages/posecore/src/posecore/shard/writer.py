@@ -10,6 +10,7 @@ import numpy as np
 
 from posecore.errors import ShardError
 from posecore.shard import sharding_codec
+from posecore.shard.card_schema import check_card
 from posecore.shard.fields import field_table, schema
 from posecore.shard.layout import (
     GROUP,
@@ -55,13 +56,15 @@ class ShardWriter:
                 added. Nothing in it may depend on time or machine, or resumed datasets would differ.
 
         Raises:
-            ShardError: The place holds something else; the message names the first key that differs.
+            ShardError: The card has a value out of bounds, or the place holds something else; the message names the
+                first key.
             StorageError: The place cannot be reached or written.
         """
         # A run that was killed before it wrote the group's own file leaves only the folders of the fields.
         expected = {field.name for field in field_table()}
         name, version = schema()
         full = json.loads(json.dumps({"schema": name, "schema_version": version, **card}))
+        check_card(full, str(url), "this cannot be stored")
         store = open_store(str(url))
         existing = store.get(GROUP)
         if existing is not None:
@@ -79,18 +82,20 @@ class ShardWriter:
 
     def committed(self) -> list[int]:
         """Ids of the shards in the manifest, sorted."""
-        return sorted(line["shard"] for line in read_manifest(self.url, self._store))
+        return sorted(line["shard"] for line in read_manifest(self.url, self._store, self.card))
 
     def quarantined(self) -> list[int]:
         """Replacements of scenes that crash the renderer, sorted."""
-        return sorted(scene for line in read_manifest(self.url, self._store) for scene in line.get("quarantined", ()))
+        return sorted(
+            scene for line in read_manifest(self.url, self._store, self.card) for scene in line.get("quarantined", ())
+        )
 
     def damaged(self) -> dict[int, str]:
         """Faults of committed shards: a file is missing or its length differs from the manifest.
 
         The folders are listed, nothing is read.
         """
-        lines = read_manifest(self.url, self._store)
+        lines = read_manifest(self.url, self._store, self.card)
         faults: dict[int, str] = {}
         for field in field_table():
             sizes = self._store.sizes(field.name) if lines else {}
@@ -120,7 +125,7 @@ class ShardWriter:
             self._store.set(shard_key(field, encoded.shard_id), encoded.files[field.name])
         stored = self._store.get(MANIFEST) or b""
         if stored != self._manifest:  # thousands of lines: parsed again only when another process has changed them
-            self._lines = {line["shard"]: _line_text(line) for line in parse_manifest(self.url, stored)}
+            self._lines = {line["shard"]: _line_text(line) for line in parse_manifest(self.url, stored, self.card)}
         self._lines[encoded.shard_id] = _line_text(encoded.line)
         self._manifest = "".join(text for _, text in sorted(self._lines.items())).encode()
         self._store.set(MANIFEST, self._manifest)

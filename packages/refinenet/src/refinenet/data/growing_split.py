@@ -29,6 +29,7 @@ from refinenet.data.split import (
     read_scenes,
     scenes_in,
 )
+from refinenet.models.checkpoint_schema import EpochRecord, read_record
 
 POLL_S = 2.0
 """Seconds between polls of a growing dataset that has too few shards to begin with."""
@@ -68,7 +69,7 @@ class GrowingSplit:
                 new, _ = read_scenes(reader, sorted({*reader.committed} - joined), skip=skip)
                 complete = len(joined | set(new)) == n_shards(reader.card)
                 _write_once(path, {"shards": sorted(new), "complete": complete})
-            content = json.loads(path.read_text())
+            content = read_record(path, EpochRecord)
             scene_of = self._scenes(reader, content["shards"])
             joined |= set(scene_of)
             yield self._divide(scene_of)[0].rows
@@ -78,7 +79,7 @@ class GrowingSplit:
     def joined(self) -> set[int]:
         """Shards that have joined in epochs begun so far."""
         begun = (self.out / GROWTH).glob("epoch-*.json")
-        return {shard for path in begun for shard in json.loads(path.read_text())["shards"]}
+        return {shard for path in begun for shard in read_record(path, EpochRecord)["shards"]}
 
     def validation_rows(self, url: str, shards: Collection[int]) -> tuple[set[int], dict[int, np.ndarray]]:
         """The readable ones among some shards, and their validation rows by shard.

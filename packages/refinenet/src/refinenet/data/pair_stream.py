@@ -75,7 +75,7 @@ class PairSource:
         With `loader.skip_bad_shards`, unreadable shards are left out, and reported with the next batch.
 
         Raises:
-            ShardError: A shard cannot be read, without that setting.
+            ShardError: A shard cannot be read or a sample cannot be used, without that setting.
         """
         fields: tuple[str, ...] = ONLINE_FIELDS if self._rasteriser is not None else PRECOMPUTED_FIELDS
         if self._rasteriser is None and (self._config.network.confidence or self._config.network.uses_depth):
@@ -85,7 +85,7 @@ class PairSource:
         read: dict[int, dict[str, np.ndarray]] = {}
         for shard in shards:
             try:
-                read[shard] = self._cache.get(shard) or self.reader.read(shard, fields)
+                read[shard] = self._cache.get(shard) or self.reader.read_checked(shard, fields)
             except ShardError as error:
                 if not self._config.loader.skip_bad_shards:
                     raise

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from posecore.errors import CheckpointError, ShardError
+from posecore.errors import ShardError
 from posecore.files import write_atomic
 from posecore.shard import ShardReader
 
-from refinenet.models.migration import migrated_record
+from refinenet.models.checkpoint_schema import SplitRecord, read_record
 
 ORDER, SHUFFLE, SAMPLE, SPLIT, STAND_IN, ON_POLICY = range(6)
 """First key of each random stream, so that no two streams of a run share draws."""
@@ -72,14 +72,8 @@ class DataRecord:
         Raises:
             CheckpointError: It is missing or damaged.
         """
-        try:
-            record = migrated_record(json.loads((out / RECORD).read_text()))
-            return cls(shards=tuple(record["shards"]), validation_scenes=tuple(record["validation_scenes"]))
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise CheckpointError(
-                f"{out / RECORD}: missing or damaged ({type(error).__name__}), so the validation scenes of this run "
-                "are lost; start a new run in another --out"
-            ) from error
+        record = read_record(out / RECORD, SplitRecord)
+        return cls(shards=tuple(record["shards"]), validation_scenes=tuple(record["validation_scenes"]))
 
 
 def read_scenes(
@@ -101,7 +95,7 @@ def read_scenes(
     scenes, bad = {}, {}
     for shard in shards:
         try:
-            read = reader.read(shard, ["scene_index", "obj_id"] if objects else ["scene_index"])
+            read = reader.read_checked(shard, ["scene_index", "obj_id"] if objects else ["scene_index"])
         except ShardError as error:
             if not skip:
                 raise

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from posecore import config as posecore_config
 from posecore.errors import CheckpointError, ConfigError
-from posecore.files import sha256_bytes, write_atomic
+from posecore.files import read_regular, sha256_bytes, write_atomic
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
@@ -23,13 +23,12 @@ from torch import Tensor, nn
 
 from refinenet import __version__
 from refinenet.config import NetworkConfig, TrainConfig
+from refinenet.models.checkpoint_schema import checked_state, parsed_metadata, require_finite
 from refinenet.models.heads import forms
-from refinenet.models.migration import migrated_config, migrated_state
+from refinenet.models.migration import migrated_config
 from refinenet.models.networks import make_network
 
 FORMAT, VERSION = "refinenet", "1"
-STATE = ("optimiser", "best_mm", "world")
-"""Keys of every optimiser state."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,10 +136,11 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
         preset: Required preset; None accepts any.
 
     Raises:
-        CheckpointError: Missing, not a checkpoint of this project, of another version, or of another preset.
+        CheckpointError: Missing, not a checkpoint of this project, of another version or preset, with metadata out of
+            bounds, or with weights that are not finite.
     """
     try:
-        content = path.read_bytes()
+        content = read_regular(path)
         with safe_open(path, "pt") as opened:
             metadata = opened.metadata() or {}
         tensors = load_tensors(content)
@@ -151,18 +151,13 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
     header = (metadata.get("format"), metadata.get("version"))
     if header != (FORMAT, VERSION):
         raise CheckpointError(f"{path}: format {header[0]} version {header[1]}, expected {FORMAT} version {VERSION}")
+    stored = parsed_metadata(metadata, path)
     try:
-        config = posecore_config.build(TrainConfig, migrated_config(json.loads(metadata["config"])), str(path))
-        provenance = Provenance(
-            config=config,
-            step=int(metadata["step"]),
-            dataset_sha256=metadata["dataset_sha256"],
-            objects=json.loads(metadata["objects"]),
-            camera_fx_px=float(metadata["camera_fx_px"]),
-        )
-    except (KeyError, ValueError) as error:
-        detail = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise CheckpointError(f"{path}: damaged metadata ({detail})") from error
+        config = posecore_config.build(TrainConfig, migrated_config(stored["config"]), f"{path}: config")
+    except ConfigError as error:
+        raise CheckpointError(f"{error}; the metadata is damaged or of another version") from error
+    provenance = Provenance(**{**stored, "config": config})
+    require_finite(tensors, path)
     if preset is not None and config.preset != preset:
         raise CheckpointError(f"{path}: a checkpoint of preset {config.preset}, expected preset {preset}")
     return Checkpoint(provenance=provenance, tensors=tensors, path=path, sha256=sha256_bytes(content))
@@ -179,11 +174,11 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
     """The optimiser's state that belongs to `last.safetensors` of this step.
 
     Raises:
-        CheckpointError: It is missing or damaged.
+        CheckpointError: It is missing or damaged; the message names the key.
     """
     path = _state_path(folder, step)
     try:
-        state = migrated_state(torch.load(path, map_location="cpu", weights_only=True))
+        content = torch.load(io.BytesIO(read_regular(path)), map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise CheckpointError(
             f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"
@@ -192,9 +187,7 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"
         ) from error
-    if missing := [key for key in STATE if key not in state]:
-        raise CheckpointError(f"{path}: holds no {missing[0]}, so the run cannot be resumed; start a new one")
-    return state
+    return checked_state(content, path)
 
 
 def drop_leftovers(folder: Path, keep: int) -> None:

@@ -5,9 +5,12 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from posecore.errors import CheckpointError, ConfigError
+from posecore.files import require_regular
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
+
+from refinenet.models.checkpoint_schema import require_finite
 
 HUB_REPOSITORY = "timm/inception_v4.tf_in1k"
 HUB_FILE = "model.safetensors"
@@ -181,6 +184,7 @@ def load_weights(stem: Stem, path: Path) -> None:
         CheckpointError: the file is missing or no safetensors file, or a tensor is missing or of another shape.
     """
     try:
+        require_regular(path)
         stored = load_file(path)
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: cannot be read as backbone weights (safetensors): {error}") from error
@@ -197,6 +201,7 @@ def load_weights(stem: Stem, path: Path) -> None:
                 f"{path}: tensor '{key}': found {present}, expected shape {tuple(tensor.shape)} "
                 f"({type(stem).__name__}, names as in timm); check backbone.name"
             )
+    require_finite(chosen, path)
     stem.load_state_dict(chosen)
 
 

@@ -1,20 +1,21 @@
 """Sources of frames to track: a BOP scene, a folder of images, a video file."""
 
 import itertools
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from posecore.bop import BopDataset
 from posecore.bop.images import COLOUR_EXTENSIONS, read_rgb
-from posecore.camera import intrinsics
+from posecore.bop.jsonfile import id_of, integer, numbers, read_json
+from posecore.camera import Camera, intrinsics
 from posecore.errors import CameraError, ConfigError, DatasetError
+from posecore.files import require_regular
 
 from refinenet.refine.image_poses import load_frame
 from refinenet.refiner import Frame, PoseRefiner
@@ -68,7 +69,7 @@ class BopScene:
 class ImageFolder:
     """The images of a folder, ordered by the numbers in their names: `f2` is before `f10`.
 
-    Names that are numbers become the frame numbers, others are numbered from 0.
+    Names that are numbers of 64 bits become the frame numbers, such as ROS stamps; others are numbered from 0.
     """
 
     folder: Path
@@ -81,7 +82,7 @@ class ImageFolder:
             kinds = ", ".join(COLOUR_EXTENSIONS)
             raise DatasetError(f"{self.folder}: no images ({kinds}) in it; give a folder of images")
         for file, after in itertools.pairwise(files):
-            if file.stem.isdecimal() and after.stem.isdecimal() and int(file.stem) == int(after.stem):
+            if (number := id_of(file.stem)) is not None and number == id_of(after.stem):
                 raise DatasetError(f"{self.folder}: {file.name} and {after.name} have one number; keep one file")
 
     def __len__(self) -> int:
@@ -91,9 +92,10 @@ class ImageFolder:
         """Yield number and frame."""
         _refuse_depth(method, self.folder)
         files = self._files()
-        are_numbers = all(file.stem.isdecimal() for file in files)
-        for index, file in enumerate(files):
-            yield int(file.stem) if are_numbers else index, self.camera.frame(read_rgb(file), str(file))
+        ids = [id_of(file.stem) for file in files]
+        are_ids = None not in ids
+        for index, (file, im_id) in enumerate(zip(files, ids, strict=True)):
+            yield index if im_id is None or not are_ids else im_id, self.camera.frame(read_rgb(file), str(file))
 
     def _files(self) -> list[Path]:
         images = (p for p in self.folder.iterdir() if p.suffix.lower().lstrip(".") in COLOUR_EXTENSIONS)
@@ -114,6 +116,10 @@ class VideoFile:
     scene_id: int = 0
 
     def __post_init__(self) -> None:
+        try:
+            require_regular(self.file, None)
+        except OSError as error:
+            raise DatasetError(f"{self.file}: cannot be read ({error.strerror}); give a video file") from error
         video = cv2.VideoCapture(str(self.file))
         opened = video.isOpened()
         video.release()
@@ -229,14 +235,16 @@ def read_camera(file: Path) -> FileCamera:
         CameraError: The file is missing, not JSON, or lacks a focal length or principal point.
     """
     try:
-        content: Any = json.loads(file.read_text(encoding="utf-8"))
-        K = intrinsics(*(float(content[key]) for key in ("fx", "fy", "cx", "cy")))
-        size_px = (int(content["width"]), int(content["height"])) if {"width", "height"} <= set(content) else None
-        return FileCamera(file=file, K=K, size_px=size_px)
-    except OSError as error:
-        raise CameraError(f"{file}: cannot be read ({error.strerror}); give a BOP camera.json") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise CameraError(f"{file}: found no numbers fx, fy, cx, cy ({error}); give a BOP camera.json") from error
+        content = read_json(file)
+        fx, fy, cx, cy = (float(numbers(content, key, 1, str(file))[0]) for key in ("fx", "fy", "cx", "cy"))
+        has_size = {"width", "height"} <= content.keys()
+        width_px, height_px = (integer(content, key, str(file)) if has_size else 1 for key in ("width", "height"))
+        camera = Camera(K=intrinsics(fx, fy, cx, cy), width_px=width_px, height_px=height_px)
+    except DatasetError as error:
+        raise CameraError(f"{error}; give a BOP camera.json") from error
+    except CameraError as error:
+        raise CameraError(f"{file}: {error}") from error
+    return FileCamera(file=file, K=camera.K, size_px=(width_px, height_px) if has_size else None)
 
 
 def _rgb(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:

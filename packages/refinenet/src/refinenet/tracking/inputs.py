@@ -1,6 +1,5 @@
 """Inputs of tracking: initial poses, meshes and symmetries."""
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -8,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from posecore.bop import ModelInfo, read_results
 from posecore.bop.annotations import ground_truth
-from posecore.bop.jsonfile import read_json
+from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
 from posecore.errors import ConfigError
 from posecore.mesh import Mesh, Units, load_mesh
@@ -104,12 +103,12 @@ def load_models(
     meshes: dict[int, Mesh] = {}
     symmetric: dict[int, ModelInfo] = {}
     for file in files:
-        numbered = re.fullmatch(r"obj_(\d+)", file.stem)
-        if numbered is None and len(possible) > 1:
+        number = id_of(file.stem.removeprefix("obj_")) if file.stem.startswith("obj_") else None
+        if number is None and len(possible) > 1:
             ids = ", ".join(map(str, possible))
             owner = "initial poses are of" if loaded is None else "the checkpoint has"
             raise ConfigError(f"{file}: {owner} objects {ids}; name the file obj_000001.ply to give its object")
-        obj_id = int(numbered[1]) if numbered else possible[0]
+        obj_id = possible[0] if number is None else number
         meshes[obj_id] = load_mesh(file, units=units)
         info_file = file.with_name("models_info.json")
         listed = read_json(info_file) if info_file.is_file() else {}

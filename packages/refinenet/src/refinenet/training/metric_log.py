@@ -7,7 +7,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from posecore.files import storage_error, write_atomic
+from posecore.files import read_regular, storage_error, write_atomic
 from torch.utils.tensorboard import SummaryWriter
 
 from refinenet.models.migration import migrated_metrics
@@ -38,10 +38,10 @@ class MetricLog:
         if not self._path.is_file():
             return []
         lines: list[dict[str, Any]] = []
-        for text in self._path.read_text(errors="replace").splitlines():
+        for text in read_regular(self._path).decode("utf-8", "replace").splitlines():
             try:
                 line = json.loads(text)
-            except ValueError:  # the line a killed run was writing
+            except (ValueError, RecursionError):  # the line a killed run was writing
                 break
             if not isinstance(line, dict) or not isinstance(line.get("step"), int):
                 break

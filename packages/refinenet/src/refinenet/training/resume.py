@@ -1,7 +1,7 @@
 """The last checkpoint of a run and the state to resume from."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ from posecore.errors import CheckpointError, ConfigError
 
 from refinenet.config import TrainConfig
 from refinenet.models import checkpoint
+from refinenet.models.checkpoint_schema import own_optimiser_state
 from refinenet.training.optimiser import learning_rate
 from refinenet.training.run import Trainer
 
@@ -73,10 +74,11 @@ def restore(run: Trainer, saved: SavedRun) -> None:
             f"{last.path}: was trained by {state['world']} processes and now there are {run.ranks.world}; resume with "
             f"torchrun --nproc-per-node {state['world']}"
         )
-    run.network.load_state_dict(last.tensors if run.ema is None else state["weights"])
+    trained = last if run.ema is None else replace(last, tensors=state.get("weights") or {})
+    trained.give_weights(run.network, run.config.network)
     if run.ema is not None:
-        run.ema.network.load_state_dict(last.tensors)
-    run.optimiser.load_state_dict(state["optimiser"])
+        last.give_weights(run.ema.network, run.config.network)
+    run.optimiser.load_state_dict(own_optimiser_state(run.optimiser, state["optimiser"], last.path))
     run.step = last.provenance.step
     if last.provenance.config.validation.pairs == run.config.validation.pairs:  # other pairs have other errors
         run.best_mm = float(state["best_mm"])

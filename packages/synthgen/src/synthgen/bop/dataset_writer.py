@@ -27,8 +27,10 @@ from posecore.errors import ConfigError, DatasetError
 from posecore.files import storage_error, write_atomic
 from posecore.mesh import Mesh
 from posecore.processes import behave_as_worker, map_unordered
+from posecore.text import printable
 
 from synthgen import lock
+from synthgen.bop.card import CARD, read_card
 from synthgen.bop.frame_maker import FrameMaker, FramePlan
 from synthgen.config import SynthConfig, migrate
 from synthgen.draw.target import TargetObject, make_targets
@@ -38,7 +40,6 @@ from synthgen.inputs.assets import Assets
 from synthgen.pairs.data_card import versions
 from synthgen.pairs.pair_maker import limit_threads
 
-CARD = "synthgen.json"
 _MAX_DEPTH_STEP = 65535
 _JPG_SPLITS = ("train_pbr",)  # BOP's training images are JPEG, its test images PNG
 _CRASHES = 3  # consecutive deaths of worker processes, without a frame in between, that end the run
@@ -293,15 +294,17 @@ def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], plan: 
     card: dict[str, Any] = {
         **asdict(plan),
         **assets.card(),
-        "objects": {str(i): {"name": Path(m.path).name, "sha256": m.sha256} for i, m in sorted(meshes.items())},
+        "objects": {
+            str(i): {"name": printable(Path(m.path).name), "sha256": m.sha256} for i, m in sorted(meshes.items())
+        },
         "config": config_tools.to_dict(config),
         "versions": versions(config),
     }
     file = folder / CARD
     try:
         if file.is_file():
-            stored = json.loads(file.read_text(encoding="utf-8"))
-            stored["config"] = migrate(stored.get("config", {}))
+            stored = read_card(folder)
+            stored["config"] = migrate(stored["config"])
             different = [k for k in card if stored.get(k) != json.loads(json.dumps(card[k]))]
             if different:
                 raise DatasetError(
@@ -315,6 +318,4 @@ def _claim(folder: Path, config: SynthConfig, meshes: Mapping[int, Mesh], plan: 
             )
     except OSError as error:
         raise storage_error(folder, error) from error
-    except json.JSONDecodeError as error:
-        raise DatasetError(f"{file}: is damaged; delete the folder and render it again") from error
     write_atomic(file, (json.dumps(card, indent=2) + "\n").encode())

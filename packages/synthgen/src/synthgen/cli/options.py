@@ -112,6 +112,42 @@ def scene_options(command: F) -> F:
     return wrapped
 
 
+_CLUSTER_OPTIONS = (
+    click.option("--scheduler", metavar="ADDRESS", help="Render on a running dask cluster instead, tls://host:port."),
+    click.option("--tls-ca", type=PATH, metavar="FILE", help="Authority of that cluster's certificates, PEM."),
+    click.option("--tls-cert", type=PATH, metavar="FILE", help="Certificate of this command there, PEM."),
+    click.option("--tls-key", type=PATH, metavar="FILE", help="Private key of that certificate, PEM. [in --tls-cert]"),
+    click.option(
+        "--dashboard",
+        is_flag=False,
+        flag_value=8787,
+        type=click.IntRange(1, 65535),
+        metavar="[PORT]",
+        help="Show the local processes in dask's web page, http://127.0.0.1:PORT/status, by default 8787. [none]",
+    ),
+)
+
+
+def cluster_options(command: F) -> F:
+    """Add the options of a cluster; the files among them reach the command as its argument `certificates`."""
+
+    @functools.wraps(command)
+    def with_certificates(*, tls_ca: Path | None, tls_cert: Path | None, tls_key: Path | None, **values: Any) -> Any:
+        from synthgen.run.cluster import Certificates
+
+        certificates = None
+        if tls_ca or tls_cert or tls_key:
+            if not (tls_ca and tls_cert):
+                raise click.UsageError("--tls-ca and --tls-cert: give both")
+            certificates = Certificates(ca=tls_ca, cert=tls_cert, key=tls_key)
+        return command(certificates=certificates, **values)
+
+    wrapped: Any = with_certificates
+    for option in reversed(_CLUSTER_OPTIONS):
+        wrapped = option(wrapped)
+    return wrapped
+
+
 def resumable(out: str) -> AbstractContextManager[None]:
     """End Ctrl-C with one line: what is in `out` by then, if anything, stays, and the same command continues there."""
 

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 import click
 from posecore.command_line import progress_bar
 
-from synthgen.cli.options import ENGINE, resumable, scene_options
+from synthgen.cli.options import ENGINE, cluster_options, resumable, scene_options
 from synthgen.names import DEVICES
 
 if TYPE_CHECKING:
     from synthgen.inputs.sources import Sources
+    from synthgen.run.cluster import Certificates
     from synthgen.run.render import RenderJob, RenderPlan
 
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     type=click.IntRange(1),
     help="Local processes. [one per GPU that cycles uses; else one per core, at most 8]",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Render on a running dask cluster instead, tcp://host:port.")
+@cluster_options
 @click.option(
     "--shard-timeout",
     type=click.FloatRange(min=0, min_open=True),
@@ -59,6 +60,8 @@ def render(
     quiet: bool,
     workers: int | None,
     scheduler: str | None,
+    certificates: "Certificates | None",
+    dashboard: int | None,
     shard_timeout: float | None,
     only: int | None,
     save: Path | None,
@@ -77,6 +80,7 @@ def render(
     synthgen render --object mesh.ply --n 1000 --out near --set distance.min=3 --set distance.max=5
     synthgen render --object mesh.ply --n 200000 --out shards --device optix
     synthgen render --object mesh.ply --n 1000000 --out s3://bucket/shards --scheduler tcp://node0:8786
+    synthgen render --object mesh.ply --n 900000 --out big --scheduler tls://node0:8786 --tls-ca ca.pem --tls-cert b.pem
     synthgen render --object mesh.ply --n 200000 --out shards --only 17 --save sample.png
     """
     from synthgen.config import load_config
@@ -91,6 +95,8 @@ def render(
         sources=sources,
         workers=workers,
         scheduler=scheduler,
+        certificates=certificates,
+        dashboard=dashboard,
         shard_timeout_s=shard_timeout,
     )
     if only is not None:

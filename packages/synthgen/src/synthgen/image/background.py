@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 from posecore.errors import ConfigError
+from posecore.image_file import picture_fault, read_picture
 
 from synthgen.image import hdri
 from synthgen.scene import Background, Scene
@@ -51,10 +52,10 @@ def draw(background: Background, width_px: int, height_px: int) -> UInt8[np.ndar
 
 
 def list_photos(folder: str | Path) -> tuple[str, ...]:
-    """Photographs of a folder, sorted by name, subfolders included; the header of each file is checked.
+    """Photographs of a folder, sorted by name, subfolders included; start and end of each file are checked.
 
     Raises:
-        ConfigError: The folder is missing, holds no readable image, or holds a broken one; the message names it.
+        ConfigError: The folder is missing, holds no image, or holds a broken one; the message names it.
     """
     root = Path(folder)
     if not root.is_dir():
@@ -62,24 +63,21 @@ def list_photos(folder: str | Path) -> tuple[str, ...]:
     photos = tuple(sorted(str(p) for p in root.rglob("*") if p.suffix.lower() in PHOTO_SUFFIXES))
     if not photos:
         raise ConfigError(f"--backgrounds {folder}: no image in it, expected {', '.join(PHOTO_SUFFIXES)} files")
-    broken = [photo for photo in photos if not cv2.haveImageReader(photo)]
-    if len(broken) == len(photos):
-        raise ConfigError(f"--backgrounds {folder}: none of its {len(photos)} images is readable, e.g. {broken[0]}")
-    if broken:
-        others = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
-        raise ConfigError(f"{broken[0]}{others}: not an image; repair it or remove it from --backgrounds {folder}")
+    faults = {photo: fault for photo in photos if (fault := picture_fault(photo))}
+    if faults:
+        (first, fault), *others = faults.items()
+        more = f" (and {len(others)} more)" if others else ""
+        raise ConfigError(f"{first}{more}: {fault}; repair it or remove it from --backgrounds {folder}")
     return photos
 
 
 @lru_cache(maxsize=PHOTOS_IN_MEMORY)
 def _photo(path: str) -> UInt8[np.ndarray, "h w 3"]:
-    image = cv2.imread(path, cv2.IMREAD_COLOR)
-    if image is None:
-        raise ConfigError(f"{path}: cannot be read as an image; remove it from the backgrounds folder")
+    image = read_picture(path, ConfigError)
     scale = PHOTO_SIDE_PX / max(image.shape[:2])
     if scale < 1.0:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    return np.ascontiguousarray(image[..., ::-1])
+    return image
 
 
 def _crop(

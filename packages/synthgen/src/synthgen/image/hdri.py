@@ -10,6 +10,8 @@ import numpy as np
 import OpenEXR
 from jaxtyping import Float, UInt8
 from posecore.errors import ConfigError
+from posecore.files import read_regular, require_regular
+from posecore.image_file import decode_image, require_size
 
 from synthgen.image.sensor import display_from_linear
 from synthgen.scene import Background, Environment, Light, Scene
@@ -216,7 +218,7 @@ def _sphere(width_px: int, height_px: int) -> tuple[Float[np.ndarray, "h w 3"], 
 
 
 def _decode(path: str) -> Float[np.ndarray, "h w 3"]:
-    image = _read_exr(path) if path.lower().endswith(".exr") else cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    image = _read_exr(path) if path.lower().endswith(".exr") else _read_radiance(path)
     if image is None or image.ndim != 3 or image.shape[2] < 3 or image.dtype != np.float32:
         raise ConfigError(
             f"{path}: cannot be decoded as an HDRI, expected a panorama in {' or '.join(SUFFIXES)}; "
@@ -232,11 +234,24 @@ def _decode(path: str) -> Float[np.ndarray, "h w 3"]:
     return np.maximum(np.nan_to_num(rgb, nan=0.0, posinf=6e4, neginf=0.0), 0.0).astype(np.float32)
 
 
+def _read_radiance(path: str) -> np.ndarray:
+    try:
+        return decode_image(read_regular(path), path, cv2.IMREAD_UNCHANGED, ConfigError)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror}); remove it from the --hdris folder") from error
+
+
 def _read_exr(path: str) -> Float[np.ndarray, "h w 3"] | None:
     try:
+        require_regular(path)
+        with OpenEXR.File(path, header_only=True) as file:
+            low, high = file.header()["dataWindow"]
+        require_size((int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1), path, ConfigError)
         with OpenEXR.File(path, separate_channels=True) as file:
             channels = {name.split(".")[-1]: np.asarray(c.pixels, np.float32) for name, c in file.channels().items()}
-    except (RuntimeError, OSError, ValueError):
+    except ConfigError:
+        raise
+    except (RuntimeError, OSError, ValueError, KeyError):
         return None
     if not {"R", "G", "B"} <= channels.keys():
         return None

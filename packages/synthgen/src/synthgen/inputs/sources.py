@@ -1,13 +1,12 @@
 """Files named on the command line, loaded: meshes, symmetries, photographs, panoramas, occluders."""
 
 import logging
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from posecore.bop import ModelInfo
-from posecore.bop.jsonfile import read_json
+from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
 from posecore.errors import ConfigError, DatasetError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
@@ -20,6 +19,8 @@ log = logging.getLogger(__name__)
 
 MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb", ".stl", ".off")
 MODELS_INFO = "models_info.json"
+LARGEST_OBJECT_ID = 2**31 - 1
+"""Of the shards' field `obj_id`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,12 +111,14 @@ def object_ids(paths: Sequence[str]) -> list[int]:
     """Object ids by file: the number of a BOP name (obj_000005.ply is 5), else 1, 2, ... in the order of the files.
 
     Raises:
-        ConfigError: Two files would get one id.
+        ConfigError: Two files would get one id, or an id does not fit 32 bits.
     """
     numbers = [_bop_number(Path(path)) for path in paths]
     ids = [number for number in numbers if number is not None]
     if not paths or len(ids) < len(paths):
         ids = list(range(1, len(paths) + 1))
+    if max(ids, default=0) > LARGEST_OBJECT_ID:
+        raise ConfigError(f"--object: a file has the object id {max(ids)}, expected at most {LARGEST_OBJECT_ID}")
     if len(set(ids)) < len(ids):
         raise ConfigError(f"--object: two files have the object id {max(ids, key=ids.count)}; rename one file")
     return ids
@@ -152,8 +155,7 @@ def info_beside(mesh_file: Path) -> ModelInfo | None:
 
 
 def _bop_number(path: Path) -> int | None:
-    match = re.fullmatch(r"obj_(\d+)", path.stem)
-    return int(match[1]) if match else None
+    return id_of(path.stem.removeprefix("obj_")) if path.stem.startswith("obj_") else None
 
 
 def find_meshes(path: Path, units: Units, option: str) -> Sequence[tuple[Path, Units]]:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from posecore import config as config_tools
-from posecore.errors import DatasetError
 from posecore.shard import ShardReader, n_shards
 
-from synthgen.bop.dataset_writer import CARD as BOP_CARD
+from synthgen.bop.card import CARD as BOP_CARD
+from synthgen.bop.card import read_card
 from synthgen.config import CutConfig, load_config, migrate
 from synthgen.pairs.data_card import migrated_card
 
@@ -27,6 +27,7 @@ def dataset_info(url: str) -> dict[str, Any]:
     if "://" not in url and (Path(url) / BOP_CARD).is_file():
         return _bop_info(Path(url))
     reader = ShardReader(url)
+    reader.require("objects", "camera", "units")
     card, lines = migrated_card(reader.card), reader.manifest_lines
     pairs = sum(map(reader.n_samples, reader.committed))
     sizes: dict[str, int] = {}
@@ -127,25 +128,19 @@ def _pair_lines(info: Mapping[str, Any]) -> list[str]:
 
 
 def _bop_info(folder: Path) -> dict[str, Any]:
-    file = folder / BOP_CARD
-    try:
-        card = json.loads(file.read_text(encoding="utf-8"))
-        config = card["config"]
-        return {
-            "kind": "BOP dataset",
-            "dataset": str(folder),
-            "split": card["split"],
-            "frames": card["frames"],
-            "sequences": card["sequences"],
-            "changed_keys": changed_keys(migrate(config)),
-            "card": {"objects": card["objects"], "camera": config["camera"], "seed": config["seed"]},
-            "assets": {name: card.get(name) for name in _ASSETS},
-            "versions": card["versions"],
-        }
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise DatasetError(
-            f"{file}: not the card of a dataset that `synthgen bop` made ({type(error).__name__}: {error})"
-        ) from error
+    card = read_card(folder)
+    config = card["config"]
+    return {
+        "kind": "BOP dataset",
+        "dataset": str(folder),
+        "split": card["split"],
+        "frames": card["frames"],
+        "sequences": card.get("sequences"),
+        "changed_keys": changed_keys(migrate(config)),
+        "card": {"objects": card["objects"], "camera": config["camera"], "seed": config["seed"]},
+        "assets": {name: card.get(name) for name in _ASSETS},
+        "versions": card["versions"],
+    }
 
 
 def _camera(camera: Mapping[str, Any]) -> str:

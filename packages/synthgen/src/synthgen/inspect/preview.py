@@ -17,6 +17,7 @@ Image = UInt8[np.ndarray, "h w 3"]
 
 CELL_PX = 256
 _CAPTION_PX = 22
+_FARTHEST_DOT_PX = 1e6
 _TITLES = (
     "scene, ground truth green, hypothesis red",
     "hypothesis and its contour",
@@ -47,7 +48,7 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         indices = range(max(first, start), min(stop, first + count))
         if not indices:
             continue
-        samples = reader.read(shard_id)
+        samples = reader.read_checked(shard_id)
         rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in indices]
     if not rows:
         rendered = sum(map(reader.n_samples, reader.committed))
@@ -107,6 +108,7 @@ def _enlarge(image: Image) -> UInt8[np.ndarray, "cell cell 3"]:
 def _dots(image: Image, uv_px: Float[np.ndarray, "n 2"], colour: tuple[int, int, int]) -> Image:
     """Dots at continuous image coordinates; OpenCV has pixel centres at integers, in units of 1/16 px here."""
     image = np.ascontiguousarray(image)
+    uv_px = uv_px[(np.abs(uv_px) < _FARTHEST_DOT_PX).all(axis=1)]  # NaN is not
     for u, v in np.rint((uv_px - 0.5) * 16).astype(int):
         cv2.circle(image, (int(u), int(v)), 16, colour, -1, cv2.LINE_AA, shift=4)
     return image

@@ -17,6 +17,7 @@ from posecore.shard import GROUP, ShardWriter
 from posecore.shard.fields import schema
 from posecore.shard.layout import check_same_card, read_card
 from posecore.store import open_store
+from posecore.text import printable
 
 from synthgen.config import CutConfig, SynthConfig, migrate
 from synthgen.draw.target import TargetObject, make_targets
@@ -84,8 +85,8 @@ def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool 
         "depth_step_m": _depth_step_m(deepest_m),
         "seed": config.seed,
         "source": {
-            "dataset": dataset.name,
-            "split": dataset.split,
+            "dataset": printable(dataset.name),
+            "split": printable(dataset.split),
             "images": len(plan.images),
             "hypotheses": "drawn" if drawn else "given",
             "sha256": plan.digest,
@@ -110,7 +111,7 @@ def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool 
 
 def _object_entry(obj_id: int, mesh: Mesh, window_side_px: float) -> dict[str, Any]:
     return {
-        "name": Path(mesh.path).name,
+        "name": printable(Path(mesh.path).name),
         "path": f"models/obj_{obj_id:06d}.ply",
         "texture": None if mesh.texture_rgb is None else f"models/obj_{obj_id:06d}.png",
         "sha256": mesh.sha256,

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from posecore.errors import ConfigError, ShardError, StorageError
 from posecore.files import storage_error
-from posecore.shard import Field, ShardReader, field_table, n_shards
+from posecore.shard import Field, ShardReader, field_table, model_keys, n_shards
 
 from synthgen.machine import free_bytes
 
@@ -216,24 +216,9 @@ def _models(reader: ShardReader) -> dict[str, bytes]:
     return {key: reader.file(key) for key in model_keys(reader)}
 
 
-def model_keys(reader: ShardReader) -> list[str]:
-    """Keys of the objects' files. A foreign card must not point outside of the dataset.
-
-    Raises:
-        ShardError: A key is not a file in `models/`.
-    """
-    objects = reader.card.get("objects", {}).values()
-    keys = [entry[part] for entry in objects for part in ("path", "texture") if entry.get(part)]
-    keys += ["models/models_info.json"] if keys else []
-    for key in keys:
-        if not re.fullmatch(r"models/[\w-][\w.-]*", key):
-            raise ShardError(f"{reader.url}: the data card names {key!r} as an object's file, expected models/NAME")
-    return keys
-
-
 def _shards(reader: ShardReader) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     for shard_id in reader.committed:
-        yield shard_id, reader.read(shard_id)
+        yield shard_id, reader.read_checked(shard_id)
 
 
 def refuse_existing(out: Path, overwrite: bool) -> None:

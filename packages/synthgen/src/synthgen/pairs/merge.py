@@ -6,15 +6,17 @@ from typing import Any
 
 import numpy as np
 from posecore import shard
+from posecore.bop.jsonfile import id_of, parse_json
+from posecore.bop.models_info import load_model_info
 from posecore.errors import ShardError
 from posecore.mesh import mesh_digest
-from posecore.shard import ShardReader, ShardWriter, load_meshes
+from posecore.schema import shown
+from posecore.shard import MODELS_INFO, ShardReader, ShardWriter, load_meshes, model_keys
 
 from synthgen import lock
 from synthgen.pairs.data_card import create_writer
-from synthgen.pairs.export import complete_dataset, model_keys
+from synthgen.pairs.export import complete_dataset
 
-MODELS_INFO = "models/models_info.json"
 _SAME = ("schema", "schema_version", "patch_px", "contour_points", "units")
 _CAMERA = ("width_px", "height_px", "fx", "fy", "cx", "cy")
 
@@ -58,6 +60,8 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
             have in common; or two datasets number the same scenes differently.
     """
     parts = [complete_dataset(url) for url in urls]
+    for part in parts:
+        part.require("objects", "camera", "units", "versions")
     _require_one_numbering(parts)
     first = parts[0]
     digests: dict[str, str] = {}
@@ -72,9 +76,11 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
                     f"{part.url}: {key} is {part.card[key]}, expected {first.card[key]} as in {first.url}; only "
                     "datasets that agree in it can be merged"
                 )
-        infos = json.loads(part.file(MODELS_INFO))
+        infos = _model_entries(part)
         for obj_id, mesh in load_meshes(part).items():
-            symmetries = {key: value for key, value in infos[str(obj_id)].items() if key.startswith("symmetries")}
+            symmetries = {
+                key: value for key, value in infos.get(str(obj_id), {}).items() if key.startswith("symmetries")
+            }
             described = mesh_digest(mesh), json.dumps(symmetries, sort_keys=True), part.url
             expected = objects.setdefault(obj_id, described)
             if expected[:2] != described[:2]:
@@ -84,6 +90,17 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
                     "the object's, or make all datasets from the same one"
                 )
     return parts
+
+
+def _model_entries(part: ShardReader) -> dict[str, Any]:
+    """Entries of a dataset's `models_info.json` by object id as text, each one checked."""
+    where = f"{part.url}/{MODELS_INFO}"
+    entries: dict[str, Any] = parse_json(part.file(MODELS_INFO), where)
+    for obj_id, entry in entries.items():
+        load_model_info(entry, f"{where}, object {obj_id}")
+        if id_of(obj_id) is None:
+            raise ShardError(f"{where}: the key {shown(obj_id)} is no object id; render the dataset again")
+    return entries
 
 
 def _source(card: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -178,7 +195,7 @@ def write_merged(
             if key != MODELS_INFO and key not in copied:
                 copied.add(key)
                 writer.add_file(key, part.file(key))
-        infos = json.loads(part.file(MODELS_INFO)) | infos
+        infos = _model_entries(part) | infos
     text = json.dumps(dict(sorted(infos.items(), key=lambda item: int(item[0]))), indent=2)
     writer.add_file(MODELS_INFO, text.encode())
     committed = set(writer.committed()) - set(writer.damaged())
@@ -200,7 +217,7 @@ class _Rows:
         sources = [(number,) if "merged" in part.card else _source(part.card) for number, part in enumerate(parts)]
         scenes: dict[tuple[Any, ...], int] = {}
         for part, source in zip(parts, sources, strict=True):
-            last = max(int(part.read(i, ["scene_index"])["scene_index"].max()) for i in part.committed)
+            last = max(int(part.read_checked(i, ["scene_index"])["scene_index"].max()) for i in part.committed)
             scenes[source] = max(scenes.get(source, 0), last + 1)
         first = dict(zip(scenes, np.cumsum([0, *scenes.values()]).tolist(), strict=False))
         self._scenes = [first[source] for source in sources]
@@ -224,7 +241,7 @@ class _Rows:
 
     def _shard(self, number: int, shard_id: int) -> dict[str, np.ndarray]:
         if self._last is None or self._last[0] != (number, shard_id):
-            values = self._parts[number].read(shard_id)
+            values = self._parts[number].read_checked(shard_id)
             values["scene_index"] = values["scene_index"] + self._scenes[number]
             self._last = (number, shard_id), values
         return self._last[1]

@@ -1,14 +1,24 @@
-"""The processes that render: local ones, or those of a running dask cluster."""
+"""The processes that render: local ones, or those of a running dask cluster.
 
+A dask scheduler or worker runs any code that it receives. Local processes listen on loopback only, with TLS and a key
+that is made for the run and passed in memory: a connection without it is refused. A cluster's certificates are options.
+"""
+
+import importlib.util
 import logging
+import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import dask
 from distributed import Client, LocalCluster, Nanny
+from distributed.security import Security
 from distributed.system import MEMORY_LIMIT
-from posecore.errors import RenderError
+from posecore.errors import ConfigError, RenderError
+from posecore.files import read_regular
 from posecore.processes import interrupts_ignored
 
 _TALKATIVE = ("distributed", "bokeh", "tornado", "asyncio")
@@ -25,37 +35,93 @@ SETTINGS = {
     "distributed.comm.timeouts.connect": "60s",
     # By default a worker that needs more than 15 s to start again, on a busy machine, is dropped for good.
     "distributed.deploy.lost-worker-timeout": "1h",
+    "distributed.worker.http.routes": [],  # dask always opens a port for HTTP: nothing is served there
     "distributed.logging": dict.fromkeys(_TALKATIVE, "critical"),  # for the workers, which apply it at their start
 }
+LOOPBACK = "127.0.0.1"
 ANSWER_S = 30.0
 """Timeout for the scheduler's answer."""
+_PAGES = [f"distributed.http.{name}" for name in ("scheduler.info", "scheduler.json", "health", "statics")]
+"""Pages beside the dashboard. Dask's default list has a proxy too."""
+_LARGEST_PEM_BYTES = 1 << 20
 _START_TRIES = 8
 _MEMORY_FRACTION = 0.9  # of the machine, for all workers
 _LEAST_BYTES = 3 << 29  # Blender with a large mesh needs 1.5 GiB; a lower limit would kill sound workers
 
 
+@dataclass(frozen=True, kw_only=True)
+class Certificates:
+    """PEM files for a scheduler that was started with TLS.
+
+    Attributes:
+        ca: Certificate of the authority that signed all certificates of the cluster.
+        cert: Certificate of this command.
+        key: Its private key; None where it is in the same file.
+    """
+
+    ca: Path
+    cert: Path
+    key: Path | None = None
+
+    def security(self) -> Security:
+        """The certificates as dask takes them.
+
+        Raises:
+            ConfigError: A file cannot be read, or is no certificate or key.
+        """
+        key = self.key or self.cert
+        for option, file in (("--tls-ca", self.ca), ("--tls-cert", self.cert), ("--tls-key", key)):
+            try:
+                content = read_regular(file, _LARGEST_PEM_BYTES)
+            except OSError as error:
+                raise ConfigError(f"{option} {file}: {error.strerror}; give a PEM file") from error
+            if b"ENCRYPTED" in content:
+                raise ConfigError(
+                    f"{option} {file}: has a passphrase, which dask would ask for; give a key without one"
+                )
+        security = Security(
+            tls_ca_file=str(self.ca), tls_client_cert=str(self.cert), tls_client_key=str(key),
+            require_encryption=True,
+        )  # fmt: skip
+        try:
+            security.get_connection_args("client")
+        except (ssl.SSLError, ValueError) as error:
+            raise ConfigError(
+                f"--tls-ca {self.ca}, --tls-cert {self.cert}, --tls-key {key}: not certificates and their key in "
+                f"PEM ({_first_line(error)})"
+            ) from error
+        return security
+
+
 @contextmanager
-def connect(workers: int, scheduler: str | None) -> Iterator[Client]:
+def connect(
+    workers: int, scheduler: str | None, *, certificates: Certificates | None = None, dashboard: int | None = None
+) -> Iterator[Client]:
     """A client of a running cluster, or of local processes that live as long as the block.
 
     Args:
         workers: Local processes; without effect with a scheduler.
         scheduler: Address of a dask scheduler, or None.
+        certificates: For a scheduler with TLS; None for one without, or where dask's own configuration names them.
+        dashboard: Port on loopback of dask's web page of local processes; None for none.
 
     Raises:
+        ConfigError: The certificates cannot be used, the dashboard's library is missing or its port is taken.
         RenderError: The scheduler does not answer, or no process can be started.
     """
     for name in list(logging.root.manager.loggerDict):  # they log a traceback for each broken connection
         if name.split(".")[0] in _TALKATIVE:  # some of distributed's loggers have levels of their own
             logging.getLogger(name).setLevel(logging.CRITICAL)
-    with dask.config.set(SETTINGS):
+    with dask.config.set({**SETTINGS, **_http(dashboard)}):
         if scheduler is not None:
-            with _remote(scheduler) as client:
+            with _remote(scheduler, certificates) as client:
                 yield client
             return
         with interrupts_ignored():
-            cluster = _local(workers)
+            cluster = _local(workers, dashboard)
         with cluster, Client(cluster) as client:
+            if dashboard not in (None, cluster.scheduler.http_server.port):  # dask takes another one in silence
+                raise ConfigError(f"--dashboard {dashboard}: this port is taken; give another one")
             yield client
 
 
@@ -88,14 +154,31 @@ def revive(local: LocalCluster, suspected: set[Any]) -> set[Any]:
     return dead - given_up
 
 
-def _local(workers: int) -> LocalCluster:
+def _http(dashboard: int | None) -> dict[str, Any]:
+    """Settings of the HTTP server that a scheduler always has."""
+    if dashboard is None:
+        return {"distributed.scheduler.http.routes": []}
+    origins = [f"{host}:{dashboard}" for host in (LOOPBACK, "localhost")]  # dask's default: pages of any web site
+    return {
+        "distributed.scheduler.http.routes": _PAGES,
+        "distributed.scheduler.dashboard.bokeh-application.allow_websocket_origin": origins,
+    }
+
+
+def _local(workers: int, dashboard: int | None) -> LocalCluster:
+    if dashboard is not None and importlib.util.find_spec("bokeh") is None:
+        raise ConfigError("--dashboard: needs the library bokeh; pip install 'synthgen[dashboard]'")
+    security = Security.temporary()
     for tries_left in reversed(range(_START_TRIES)):
         try:
             return LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=":0",
+                host=LOOPBACK,
+                security=security,
+                dashboard_address=f"{LOOPBACK}:{dashboard or 0}",
+                scheduler_kwargs={"dashboard": dashboard is not None},
                 silence_logs=logging.CRITICAL,
                 memory_limit=memory_limit_bytes(workers),
             )
@@ -108,12 +191,19 @@ def _local(workers: int) -> LocalCluster:
     raise AssertionError("the last try returns or raises")
 
 
-def _remote(scheduler: str) -> Client:
+def _remote(scheduler: str, certificates: Certificates | None) -> Client:
+    is_encrypted = scheduler.startswith("tls://")
+    if certificates is not None and not is_encrypted:
+        raise ConfigError(f"--scheduler {scheduler}: expected tls://HOST:PORT with --tls-ca and --tls-cert")
+    security = Security() if certificates is None else certificates.security()
+    if is_encrypted and not (security.tls_ca_file and security.tls_client_cert):
+        raise ConfigError(f"--scheduler {scheduler}: needs the certificates --tls-ca and --tls-cert")
     try:
-        return Client(scheduler, timeout=ANSWER_S)
+        return Client(scheduler, timeout=ANSWER_S, security=security)
     except (OSError, ValueError) as error:
+        refused = " with these certificates" if is_encrypted else ""
         raise RenderError(
-            f"--scheduler {scheduler}: no dask scheduler answers there; start one with `dask scheduler` and "
+            f"--scheduler {scheduler}: no dask scheduler answers there{refused}; start one with `dask scheduler` and "
             "workers with `dask worker ADDRESS --nthreads 1`"
         ) from error
 

@@ -75,6 +75,8 @@ def run(
     redo: Collection[int] = (),
     shard_timeout_s: float | None = None,
     gpus: tuple[str, ...] = (),
+    certificates: cluster.Certificates | None = None,
+    dashboard: int | None = None,
 ) -> None:
     """Render every shard that is missing and commit it.
 
@@ -88,6 +90,8 @@ def run(
         shard_timeout_s: Seconds after which a worker without result is killed and its shard rendered again; None: 20
             times the median of the finished shards, at least 5 minutes, and an hour until three are finished.
         gpus: See `RendererPlugin`.
+        certificates: See `cluster.connect`.
+        dashboard: See `cluster.connect`.
 
     Raises:
         PoseError: A scene cannot be drawn, the dataset cannot be written, workers keep dying, or too many scenes are
@@ -97,7 +101,8 @@ def run(
     missing = [i for i in range(shard.n_shards(job.card)) if i not in committed]
     if not missing:
         return
-    with cluster.connect(min(workers, len(missing)), scheduler) as client:
+    local = min(workers, len(missing))
+    with cluster.connect(local, scheduler, certificates=certificates, dashboard=dashboard) as client:
         plugin = RendererPlugin(job, gpus)
         _register(client, plugin)
         Dispatcher(

@@ -17,6 +17,7 @@ from synthgen.inputs.sources import Sources
 from synthgen.machine import cores, require_free_space, size_text
 from synthgen.pairs import data_card
 from synthgen.run import dispatcher
+from synthgen.run.cluster import Certificates
 from synthgen.run.estimate import estimate
 from synthgen.run.shard_job import ShardJob
 
@@ -37,6 +38,8 @@ class RenderJob:
         workers: Local processes; None: one per GPU that Cycles uses, else one per core, at most MOST_WORKERS.
         scheduler: Address of a running dask scheduler whose workers render; None for local processes.
         shard_timeout_s: See `dispatcher.run`.
+        certificates: For a scheduler with TLS.
+        dashboard: Port of dask's web page of local processes, on this machine only; None for none.
     """
 
     out: str
@@ -46,12 +49,20 @@ class RenderJob:
     workers: int | None = None
     scheduler: str | None = None
     shard_timeout_s: float | None = None
+    certificates: Certificates | None = None
+    dashboard: int | None = None
 
     def __post_init__(self) -> None:
         if self.workers and self.scheduler:
             raise ConfigError(
                 "--workers starts local processes, --scheduler uses the workers of a cluster: give only one option"
             )
+        if self.certificates and not self.scheduler:
+            raise ConfigError(
+                "--tls-ca and --tls-cert are for --scheduler; local processes have certificates of their own"
+            )
+        if self.dashboard and self.scheduler:
+            raise ConfigError("--dashboard is for local processes; the scheduler of a cluster has its own")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,6 +174,8 @@ def render_dataset(
             redo=set(damaged),
             shard_timeout_s=job.shard_timeout_s,
             gpus=gpus,
+            certificates=job.certificates,
+            dashboard=job.dashboard,
         )
         return RenderSummary(url=job.out, pairs=total, quarantined=tuple(writer.quarantined()))
 

@@ -3,27 +3,53 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from msgspec import Meta, Struct
 from posecore.camera import Camera, intrinsics
 from posecore.contour import contour_mask
 from posecore.errors import RenderError, ShardError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
+from posecore.schema import check
 from posecore.shard import BIT_OBJECT, ShardReader, field_table, load_meshes
+from posecore.shard.card_schema import Name
 
 from synthgen.draw.target import hull
 from synthgen.pairs.data_card import migrated_card
 
-_REQUIRED = {  # keys of the configuration that checks compare samples with
-    "": ("hypotheses_per_scene", "hypothesis_engine"),
-    "distance": ("unit", "min", "max"),
-    "perturbation": ("max_angle_deg", "max_translation_diameter"),
-}
+_ADVICE = "only datasets made by `synthgen render` and `synthgen cut` can be verified"
+_Positive = Annotated[float, Meta(gt=0, le=1e6)]
 
-_REQUIRED_OF_CUT = {"": ("window", "scale")}
+
+class _Distance(Struct):
+    unit: Literal["m", "diameter"]
+    min: _Positive
+    max: _Positive
+
+
+class _Perturbation(Struct):
+    max_angle_deg: Annotated[float, Meta(ge=0, le=180)]
+    max_translation_diameter: Annotated[float, Meta(ge=0, le=100)]
+
+
+class _Recipe(Struct):
+    """Keys of a recipe that checks compare samples with."""
+
+    hypotheses_per_scene: Annotated[int, Meta(ge=1, le=1_000_000)]
+    hypothesis_engine: Name
+    engine: Name
+    distance: _Distance
+    perturbation: _Perturbation
+
+
+class _Cut(Struct):
+    """The same of pairs that were cut from images."""
+
+    window: Name
+    scale: _Positive
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -89,22 +115,13 @@ def load_facts(reader: ShardReader) -> Facts:
     card = migrated_card(reader.card)
     if "merged" in card:
         raise ShardError(f"{reader.url}: was merged from {len(card['merged'])} datasets; verify those instead")
-    try:
-        camera = card["camera"]
-        K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
-        whole = Camera(K=K, width_px=camera["width_px"], height_px=camera["height_px"])
-        required, recipe = (_REQUIRED_OF_CUT, card["cut"]) if "cut" in card else (_REQUIRED, card["config"])
-        for group, keys in required.items():
-            for key in keys:
-                (recipe[group] if group else recipe)[key]
-        meshes = load_meshes(reader)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        if isinstance(error, ShardError):
-            raise
-        raise ShardError(
-            f"{reader.url}: the data card lacks entries that `synthgen render` and `synthgen cut` write "
-            f"({type(error).__name__}: {error}); only datasets made by them can be verified"
-        ) from error
+    reader.require("objects", "camera", *(("source",) if "cut" in card else ("config",)))
+    recipe, schema = (card["cut"], _Cut) if "cut" in card else (card["config"], _Recipe)
+    check(recipe, schema, f"{reader.url}: the data card's {'cut' if 'cut' in card else 'config'}", ShardError, _ADVICE)
+    camera = card["camera"]
+    K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
+    whole = Camera(K=K, width_px=camera["width_px"], height_px=camera["height_px"])
+    meshes = load_meshes(reader)
     return Facts(
         card=card, meshes=meshes, hulls_m={obj_id: hull(mesh) for obj_id, mesh in meshes.items()}, camera=whole
     )

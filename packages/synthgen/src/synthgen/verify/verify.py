@@ -10,6 +10,7 @@ import numpy as np
 from posecore.errors import ShardError, StorageError
 from posecore.processes import behave_as_worker, spawned
 from posecore.raster import Rasteriser
+from posecore.schema import parse_json
 from posecore.shard import ShardReader, n_shards
 from posecore.shard.layout import metadata
 
@@ -190,8 +191,8 @@ def _arrays(reader: ShardReader) -> Finding:
     wrong = []
     for key, content in expected.items():
         try:
-            right = json.loads(reader.file(key)) == content
-        except (ShardError, ValueError):
+            right = parse_json(reader.file(key), key, ShardError, "") == content
+        except ShardError:
             right = False
         if not right:
             wrong.append(key)
