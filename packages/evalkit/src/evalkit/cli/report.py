@@ -20,7 +20,9 @@ from evalkit.cli.options import FOLDER, split_option, verbose_option, vss_option
 @split_option
 @vss_option
 @workers_option
-@click.option("--worst", type=click.IntRange(0, 200), default=12, help="Pictures of worst cases.")
+@click.option(
+    "--worst", type=click.IntRange(0, 200), default=12, help="Worst cases with pictures; 0 leaves out all pictures."
+)
 @verbose_option
 def report(
     dataset: Path | None,
