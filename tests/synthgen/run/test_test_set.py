@@ -12,7 +12,7 @@ from synthgen.config import load_config
 from synthgen.inputs.sources import Sources
 from synthgen.run.bop import BopJob, render_bop_dataset
 from synthgen.run.render import RenderJob, render_dataset
-from synthgen.run.test_set import SEED_DISTANCE, default_count, test_config
+from synthgen.run.test_set import SEED_DISTANCE, default_count, images_config
 
 
 @pytest.mark.parametrize(
@@ -37,10 +37,10 @@ def test_a_url_holds_no_test_images(tug_ply):
 def test_a_recipe_for_many_objects_a_frame_suits_a_single_one():
     pbr = load_config("pbr")
     assert pbr.frames.objects == (5, 15)
-    assert test_config(replace(pbr, frames=replace(pbr.frames, instances=1)), 1).frames.objects == (1, 1)
-    assert test_config(pbr, 2).frames.objects == (5, 10)
-    assert test_config(pbr, 2).seed == pbr.seed + SEED_DISTANCE
-    assert test_config(replace(pbr, seed=2**63 - 1), 2).seed == SEED_DISTANCE
+    assert images_config(replace(pbr, frames=replace(pbr.frames, instances=1)), 1).frames.objects == (1, 1)
+    assert images_config(pbr, 2).frames.objects == (5, 10)
+    assert images_config(pbr, 2).seed == pbr.seed + SEED_DISTANCE
+    assert images_config(replace(pbr, seed=2**63 - 1), 2).seed == SEED_DISTANCE
 
 
 def contents(folder):

@@ -56,7 +56,7 @@ def render_test_set(
         return
     write_dataset(
         Path(out) / TEST_SET,
-        test_config(shards.config, len(shards.meshes)),
+        images_config(shards.config, len(shards.meshes)),
         shards.meshes,
         FramePlan(frames=count),
         assets=shards.assets,
@@ -66,7 +66,7 @@ def render_test_set(
     )
 
 
-def test_config(config: SynthConfig, objects: int) -> SynthConfig:
+def images_config(config: SynthConfig, objects: int) -> SynthConfig:
     """Configuration of the images: the pairs' with another seed, and no more objects in an image than there are."""
     low, high = config.frames.objects
     most = objects * config.frames.instances
