@@ -23,7 +23,8 @@ def test_every_run_has_a_name_of_its_own(run, name):
 
 
 def test_test_images_are_in_local_datasets_alone(tmp_path):
-    assert find_test_set(str(tmp_path)) is None
-    assert find_test_set("s3://bucket/shards") is None
+    assert find_test_set(str(tmp_path)) == find_test_set("s3://bucket/shards") == "no test images"
     (tmp_path / "test_bop").mkdir()
+    assert "not complete" in find_test_set(str(tmp_path))
+    (tmp_path / "test_bop/test_targets_bop19.json").write_text("[]")
     assert find_test_set(f"{tmp_path}/") == tmp_path / "test_bop"

@@ -120,9 +120,9 @@ def _refine_test_set(shards: str, folder: Path, config: TrainConfig, quiet: bool
     from refinenet.refine.test_set import TestSetJob, find_test_set, refine_test_set
 
     images = find_test_set(shards)
-    if images is None:
+    if isinstance(images, str):
         click.echo(
-            f"{shards}: no test images, so nothing is refined for a report; on your own images: refinenet refine "
+            f"{shards}: {images}, so nothing is refined for a report; on your own images: refinenet refine "
             f"--checkpoint {folder / 'best.safetensors'} --dataset DIR --init POSES.csv --out results/NAME.csv"
         )
         return

@@ -81,10 +81,14 @@ class TestSetSummary:
         return "\n".join([*lines, note, f"next: evalkit report {named}"])
 
 
-def find_test_set(url: str) -> Path | None:
-    """Folder of the test images beside the shards of a dataset; None without one, as in URLs."""
+def find_test_set(url: str) -> Path | str:
+    """Folder of the test images beside the shards of a dataset, or the reason for none in words."""
     folder = Path(url) / TEST_SET
-    return folder if "://" not in url and folder.is_dir() else None
+    if "://" in url or not folder.is_dir():
+        return "no test images"
+    if not (folder / TARGETS).is_file():
+        return "test images are not complete (the same `synthgen render` again completes them)"
+    return folder
 
 
 def refine_test_set(

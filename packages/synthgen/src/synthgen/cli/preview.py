@@ -24,8 +24,7 @@ def preview(shards: str, out: Path, count: int, first: int | None) -> None:
     synthgen preview shards --out sheet.png
     synthgen preview shards --out sheet.png --count 20 --first 1000
     """
-    from synthgen.inspect.preview import object_lines, save_contact_sheet
+    from synthgen.inspect.preview import save_contact_sheet
 
-    echo_lines(object_lines(shards))
-    width_px, height_px = save_contact_sheet(shards, out, count, first=first)
+    width_px, height_px = save_contact_sheet(shards, out, count, first=first, on_objects=echo_lines)
     click.echo(f"{out}: {width_px} x {height_px} px", err=True)

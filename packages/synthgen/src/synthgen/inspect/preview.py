@@ -1,7 +1,7 @@
 """Contact sheets: samples of a dataset with their labels overlaid."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 
@@ -79,14 +79,22 @@ def _spread(reader: ShardReader, count: int) -> list[int]:
     return sorted(chosen)
 
 
-def object_lines(url: str) -> list[str]:
-    """A line with the diameter for each object of a dataset's data card."""
-    objects = ShardReader(url).card["objects"].values()
-    return [diameter_text(card["name"], card["diameter_m"]) for card in objects]
-
-
-def save_contact_sheet(url: str, file: Path, count: int, *, first: int | None = None) -> tuple[int, int]:
+def save_contact_sheet(
+    url: str,
+    file: Path,
+    count: int,
+    *,
+    first: int | None = None,
+    on_objects: Callable[[Sequence[str]], None] = lambda lines: None,
+) -> tuple[int, int]:
     """Write a contact sheet as a picture; see `contact_sheet`.
+
+    Args:
+        url: Shard dataset.
+        file: Picture.
+        count: Rows at most.
+        first: Index of the first of consecutive samples.
+        on_objects: Called once with a line for each object, its diameter.
 
     Returns:
         Width and height, pixels.
@@ -98,6 +106,8 @@ def save_contact_sheet(url: str, file: Path, count: int, *, first: int | None = 
     """
     if file.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise ConfigError(f"--out {file}: expected a .png or .jpg file")
+    objects = ShardReader(url).card["objects"].values()
+    on_objects([diameter_text(card["name"], card["diameter_m"]) for card in objects])
     sheet = contact_sheet(url, count, first=first)
     ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
     assert ok

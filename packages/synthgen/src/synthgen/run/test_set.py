@@ -11,6 +11,7 @@ from synthgen.bop.dataset_writer import write_dataset
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import SynthConfig
 from synthgen.inputs.sources import Sources
+from synthgen.run.estimate import estimate
 from synthgen.run.shard_job import ShardJob
 
 MOST_BY_DEFAULT = 100
@@ -54,16 +55,20 @@ def render_test_set(
     """
     if not count:
         return
-    write_dataset(
-        Path(out) / TEST_SET,
-        images_config(shards.config, len(shards.meshes)),
-        shards.meshes,
-        FramePlan(frames=count),
-        assets=shards.assets,
-        infos=sources.infos(shards.meshes),
-        workers=workers if shards.config.engine == "raster" else max(2, workers),
-        on_frame=lambda scene_id, im_id: on_image(1),
-    )
+    try:
+        write_dataset(
+            Path(out) / TEST_SET,
+            images_config(shards.config, len(shards.meshes)),
+            shards.meshes,
+            FramePlan(frames=count),
+            assets=shards.assets,
+            infos=sources.infos(shards.meshes),
+            workers=workers if shards.config.engine == "raster" else max(2, workers),
+            on_frame=lambda scene_id, im_id: on_image(1),
+        )
+    except ConfigError as error:
+        estimate(shards, scenes=1)  # pairs that cannot be drawn either name the setting to blame
+        raise ConfigError(f"test images: {error}; or leave them out with --test-images 0") from error
 
 
 def images_config(config: SynthConfig, objects: int) -> SynthConfig:
