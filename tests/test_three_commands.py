@@ -146,17 +146,19 @@ def without_times(text):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["empty", "other dataset", "other poses"])
+@pytest.mark.parametrize("case", ["empty", "other dataset", "other poses", "a file of one's own"])
 def test_poses_of_other_images_are_not_mixed(work, tmp_path, monkeypatch, case):
     """`results/` of the working folder, or that of the run where a report of both would compare what differs."""
     monkeypatch.chdir(tmp_path)
     run_folder = shutil.copytree(work[0] / "runs/compact", tmp_path / "runs/mine")
     if case != "empty":
         shutil.copytree(work[0] / "results", tmp_path / "results")
+        changed = "mine" if case.startswith("a file") else "initial"
         sidecar = read_sidecar(work[0] / "results/initial.csv")
         poses = read_results(work[0] / "results/initial.csv")
         other = {"dataset": str(tmp_path)} if case == "other dataset" else {}
-        write_results(tmp_path / "results/initial.csv", poses[: 3 if other else 2], sidecar | other)
+        count = 2 if case == "other poses" else 3
+        write_results(tmp_path / f"results/{changed}.csv", poses[:count], sidecar | other)
     before = {file: file.read_bytes() for file in tmp_path.glob("results/*")}
     job = TestSetJob(dataset=work[0] / "shards/test_bop", run=Path("runs/mine"), device="cpu", threads=1)
     done = refine_test_set(job)

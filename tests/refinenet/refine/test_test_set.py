@@ -16,6 +16,7 @@ from refinenet.refine.test_set import find_test_set, run_name
         ("a/run", "a-run"),
         ("/data/a/run", "data-a-run"),
         ("../run", "up-run"),
+        ("runs/initial", "run-initial"),
     ],
 )
 def test_every_run_has_a_name_of_its_own(run, name):

@@ -21,6 +21,7 @@ from refinenet.refine.registry import MethodSettings
 RESULTS = Path("results")
 """Folder of result files in the working folder, the one that `evalkit report` reads."""
 INITIAL = "initial.csv"
+BEST = "best.safetensors"
 PERTURBATION = Level(angle_deg=20.0, translation_diameter=0.2)
 """Largest errors of the initial poses: `evalkit perturb --random-up-to 20 --random-translation 0.2` draws the same."""
 TARGETS = "test_targets_bop19.json"
@@ -106,13 +107,14 @@ def refine_test_set(
     Raises:
         PoseError: The test images or the checkpoint cannot be read, or the files cannot be written.
     """
-    best = job.run / "best.safetensors"
+    best = job.run / BEST
     dataset = BopDataset(job.dataset)
     obj_ids = tuple(sorted(int(key) for key in checkpoint.load(best).provenance.objects))
     if not any(target.obj_id in obj_ids for target in dataset.targets):
         return None
-    folder = RESULTS if _has_room(dataset, obj_ids) else job.run / RESULTS
-    initial, refined = folder / INITIAL, folder / f"{run_name(job.run)}.csv"
+    name = f"{run_name(job.run)}.csv"
+    folder = RESULTS if _has_room(dataset, obj_ids, name) else job.run / RESULTS
+    initial, refined = folder / INITIAL, folder / name
     poses = _write_initial(dataset, initial, obj_ids)
     method = MethodSettings(checkpoint=best, device=job.device)
     refine = RefineJob(method=method, dataset=job.dataset, init=initial, out=refined, threads=job.threads)
@@ -121,10 +123,11 @@ def refine_test_set(
 
 
 def run_name(run: Path) -> str:
-    """Name of a run's result file, another one for each folder: `compact` for runs/compact, `a-b` for a/b."""
+    """Name of a run's result file: `compact` for runs/compact, `a-b` for a/b."""
     parts = [part for part in Path(os.path.normpath(run)).parts if part != os.sep]
     kept = parts[1:] if len(parts) > 1 and parts[0] == "runs" else parts
-    return "-".join("up" if part == ".." else part for part in kept)
+    name = "-".join("up" if part == ".." else part for part in kept)
+    return f"run-{name}" if f"{name}.csv" == INITIAL else name
 
 
 def _write_initial(dataset: BopDataset, out: Path, obj_ids: Collection[int]) -> int:
@@ -134,14 +137,20 @@ def _write_initial(dataset: BopDataset, out: Path, obj_ids: Collection[int]) -> 
     )  # fmt: skip
 
 
-def _has_room(dataset: BopDataset, obj_ids: Collection[int]) -> bool:
-    """Whether `results/` can hold the files: a report of the working folder then has poses of one dataset only."""
+def _has_room(dataset: BopDataset, obj_ids: Collection[int], name: str) -> bool:
+    """Whether `results/` can hold the files: a report of the working folder then compares what belongs together.
+
+    A refined file of that name is replaced if a training run wrote it.
+    """
     try:
         require_writable(RESULTS / INITIAL)
         for path in (path for folder in (Path(), RESULTS) for path in sorted(folder.glob("*.csv"))):
             named = (read_sidecar(path) or {}).get("dataset")
             if named and Path(named).resolve() != dataset.root.resolve():
                 return False
+        present = read_sidecar(RESULTS / name) or {}
+        if (RESULTS / name).exists() and (present.get("init"), present.get("checkpoint")) != (INITIAL, BEST):
+            return False
         with TemporaryDirectory() as folder:
             _write_initial(dataset, Path(folder) / INITIAL, obj_ids)
             new = (Path(folder) / INITIAL).read_bytes()

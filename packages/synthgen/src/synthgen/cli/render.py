@@ -74,7 +74,7 @@ def render(
     save: Path | None,
     **values: Any,
 ) -> None:
-    """Render N training pairs as a sharded Zarr dataset.
+    """Render N training pairs as a sharded Zarr dataset, and some test images of other scenes as a BOP dataset.
 
     A stop at any moment, even kill -9, loses only the shards in progress; the same command again continues and ends
     with the same bytes. A scene that crashes the renderer twice is replaced by another draw, and reported.
