@@ -36,7 +36,19 @@ TEST_PAIRS = 1024
 def render(arguments: argparse.Namespace, out: Path, n: int, count: int, seed: int) -> None:
     """Render pairs with `count` hypotheses a scene."""
     command = [sys.executable, "-m", "synthgen.cli", "render", "--object", str(arguments.object), "--out", str(out)]
-    command += ["--n", str(n), "--seed", str(seed), "--engine", "raster", "--quiet", "--preset", arguments.preset]
+    command += [
+        "--n",
+        str(n),
+        "--seed",
+        str(seed),
+        "--engine",
+        "raster",
+        "--test-images",
+        "0",
+        "--quiet",
+        "--preset",
+        arguments.preset,
+    ]
     command += ["--set", f"patch_px={PATCH_PX}", "--set", "window.min_area_px=60", "--set", "shard_size=64"]
     subprocess.run([*command, "--hypotheses-per-scene", str(count)], check=True)
 

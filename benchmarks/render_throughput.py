@@ -197,7 +197,7 @@ def main() -> None:
     config = load_config(arguments.preset, arguments.overrides, {"engine": arguments.engine})
     mesh = load_mesh(arguments.object, units="mm")
     command = [sys.executable, "-m", "synthgen.cli", "render", "--object", str(arguments.object)]
-    command += ["--engine", arguments.engine, "--preset", arguments.preset]
+    command += ["--engine", arguments.engine, "--preset", arguments.preset, "--test-images", "0"]
     command += [part for override in arguments.overrides for part in ("--set", override)]
     rates: list[float] = []
     peers: dict[str, list[float]] = {"none": [], "default": []}

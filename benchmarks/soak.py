@@ -58,7 +58,7 @@ class Soak:
         settings = [word for assignment in a.set for word in ("--set", assignment)]
         return [
             *(sys.executable, "-m", "synthgen.cli", "render", *named, "--out", str(folder), "--n", str(a.n), "--quiet"),
-            *("--engine", a.engine, "--workers", str(a.workers), *settings, *extra),
+            *("--engine", a.engine, "--workers", str(a.workers), "--test-images", "0", *settings, *extra),
         ]
 
     def start(self, folder: Path) -> subprocess.Popen[str]:

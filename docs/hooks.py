@@ -151,8 +151,10 @@ def _parameters(command: click.Command) -> list[str]:
             if parameter.hidden:
                 continue
             name, text = parameter.get_help_record(context) or ("", "")
+        elif not (name := parameter.make_metavar(context)):  # only refused, see `renamed_arguments`
+            continue
         else:
-            name, text = parameter.make_metavar(context), "Argument, see above."
+            text = "Argument, see above."
         rows.append(f"| <code>{_cell(name)}</code> | {_cell(text)} |")
     return ["| argument or option | meaning |", "|---|---|", *rows] if rows else []
 

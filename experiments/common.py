@@ -252,6 +252,7 @@ def trainings(work: Path, what: Comparison) -> Iterator[Step]:
     for group, (which, objects) in (groups or {"": ("", what.objects)}).items():
         for (options, divisor), name in shards.items():
             render = f"synthgen render {objects} {what.scenes} {options} --n {what.pairs // divisor} --seed 1"
+            render += " --test-images 0"
             yield Step(
                 name=f"{name}{group}",
                 why=f"Training pairs{which}, from meshes alone.",

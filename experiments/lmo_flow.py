@@ -108,7 +108,8 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
             name="pairs",
             why="Training pairs, from meshes alone.",
             command=words(
-                f"synthgen render --object {named} --n {chosen.pairs} --seed 1 --preset linemod {chosen.render} "
+                f"synthgen render --object {named} --n {chosen.pairs} --test-images 0 --seed 1 --preset linemod "
+                f"{chosen.render} "
                 f"{inputs.behind()} {lights} --occluders {named} {PATCHES} --set window.padding=0.35 "
                 f"--set hypotheses_per_scene=1 --set occluders.visible_fraction=[0.5,1.0] {chosen.smaller} "
                 f"--out {folder}/pairs"
@@ -227,8 +228,8 @@ def mistakes(work: Path, models: Path, size: Size, seed: int, scenes: str) -> It
         name=f"mistakes{seed}",
         why="Those, cut out of the frames.",
         command=words(
-            f"synthgen cut {frames} --hypotheses {folder}/weighed{seed}.csv {PATCHES} --set scale=2.2 {size.smaller} "
-            "--workers 2 "
+            f"synthgen cut --dataset {frames} --hypotheses {folder}/weighed{seed}.csv {PATCHES} --set scale=2.2 "
+            f"{size.smaller} --workers 2 "
             f"--out {folder}/mistakes{seed}"
         ),
         leaves=f"mistakes{seed}/manifest.jsonl",

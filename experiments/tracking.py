@@ -75,7 +75,7 @@ def plan(work: Path, size: str, inputs: Inputs) -> list[Step]:
                     name=f"track-{part}",
                     why=f"Sequence {scene}, tracked by network '{name}'.",
                     command=words(
-                        f"refinenet track {folder}/test_bop --scene {scene} --checkpoint {checkpoint}"
+                        f"refinenet track --dataset {folder}/test_bop --scene {scene} --checkpoint {checkpoint}"
                         f" --init {folder}/results/initial.csv --name {name} --out {folder}/parts/{part}.csv"
                     ),
                     leaves=f"parts/{part}.csv",

@@ -26,4 +26,4 @@ def kill(process: subprocess.Popen) -> None:
     for member in family:
         with suppress(psutil.NoSuchProcess):
             member.kill()
-    process.wait(timeout=60)
+    process.wait()

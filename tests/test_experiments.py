@@ -144,7 +144,7 @@ def test_a_wrong_line_is_found(tmp_path) -> None:
     with pytest.raises(Exception, match="no_such"):
         check_line([*mesh, "3", "--set", "window.no_such=1"])
     with pytest.raises(Exception, match="no_such"):
-        check_line(["synthgen", "cut", "a", "--out", "b", "--set", "no_such=1"])
+        check_line(["synthgen", "cut", "--dataset", "a", "--out", "b", "--set", "no_such=1"])
 
 
 @pytest.mark.slow

@@ -41,10 +41,12 @@ def test_smoke_run_ends_in_a_report_and_is_not_repeated(tmp_path: Path) -> None:
     assert str(page) in first.stdout
     summary = json.loads((work / "report" / "summary.json").read_text())
     names = [entry["name"] for entry in summary["against_initial"]]
-    assert "quick" in names
+    assert names == ["compact", "shipped"]
     assert all(entry["missing"] == 0 for entry in summary["against_initial"])
-    shown = [shlex.split(line.split("$ ", 1)[1]) for line in first.stdout.splitlines() if line.startswith("  $ ")]
-    assert [words[:2] for words in shown][:3] == [["synthgen", "render"], ["synthgen", "bop"], ["refinenet", "train"]]
+    shown = [shlex.split(line.split("&& ", 1)[1]) for line in first.stdout.splitlines() if line.startswith("  $ cd ")]
+    assert [words[:2] for words in shown] == [
+        ["synthgen", "render"], ["refinenet", "train"], ["refinenet", "refine"], ["evalkit", "report"]
+    ]  # fmt: skip
 
     written = page.stat().st_mtime_ns
     second = smoke(work)
@@ -65,7 +67,7 @@ def recorder(ran: list) -> Callable:
 
 
 def test_a_step_that_changed_makes_the_later_ones_run_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    everything, ran = list(quickstart().steps(tmp_path, quickstart().SMOKE)), []
+    everything, ran = list(quickstart().steps(quickstart().SMOKE)), []
     names = [step.name for step in everything]
     monkeypatch.setattr(chain, "run_step", recorder(ran))
     chain.run_all(tmp_path, everything)
@@ -87,7 +89,7 @@ def test_a_step_that_changed_makes_the_later_ones_run_again(tmp_path: Path, monk
 
 
 def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    everything, ran = list(quickstart().steps(tmp_path, quickstart().SMOKE)), []
+    everything, ran = list(quickstart().steps(quickstart().SMOKE)), []
     record = recorder(ran)
 
     def stop_in_training(step, work, interrupted):
@@ -101,13 +103,13 @@ def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.Monk
     ran.clear()
     chain.run_all(tmp_path, everything)
     assert ran[0] == ("train", True)
-    assert ran[1][0] == "start-poses"
+    assert ran[1][0] == "refine-shipped"
 
 
 def summary_with(vss_gain: float, xy: float, rotation: float, missing: int = 0) -> dict:
     ratio = {"tx_mm": xy, "ty_mm": xy, "tz_mm": 1.0, "re_sym_deg": rotation}
     entry = {
-        "name": "quick",
+        "name": "compact",
         "missing": missing,
         "vss_mean": {"reference": 0.6, "refined": 0.6 + vss_gain},
         "medians": {name: {"ratio": value} for name, value in ratio.items()},

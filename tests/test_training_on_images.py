@@ -36,7 +36,18 @@ def work(tmp_path_factory, tug_ply: Path) -> Path:
     found = ("--out", work / "found.csv", "--candidates", work / "all.csv", "--keep-failed")
     run(refinenet, "refine", "--method", "search", *given, *found, "--iterations", 1)
     settings = ("--patch-px", 64, "--set", "contour_points=48", "--set", "shard_size=8", "--set", "min_area_px=30")
-    run(synthgen, "cut", work / "bop", "--hypotheses", work / "all.csv", *settings, "--out", work / "cut", "--quiet")
+    run(
+        synthgen,
+        "cut",
+        "--dataset",
+        work / "bop",
+        "--hypotheses",
+        work / "all.csv",
+        *settings,
+        "--out",
+        work / "cut",
+        "--quiet",
+    )
     run(synthgen, "merge", work / "rendered", work / "cut", "--out", work / "both", "--quiet")
     return work
 

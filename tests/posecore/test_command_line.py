@@ -11,6 +11,7 @@ from posecore.command_line import (
     ErrorReportingGroup,
     end_early,
     progress_bar,
+    renamed_arguments,
     renamed_options,
     stoppable,
     verbose_option,
@@ -146,3 +147,24 @@ def test_nothing_is_printed_before_the_first_visible_task(capsys):
     with progress_bar(False) as bar:
         bar.update(bar.add_task("pairs", total=None, visible=False), total=3, completed=3, visible=True)
     assert "3/3" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("lmo",), "check ... lmo is now check ... --dataset lmo"),
+        (("lmo", "a.csv", "b.csv"), "is now check ... --dataset lmo --results a.csv --results b.csv"),
+    ],
+)
+def test_positional_arguments_of_earlier_versions_are_refused_with_their_options(arguments, text):
+    @click.command()
+    @click.option("--dataset", required=True)
+    @renamed_arguments("--dataset", "--results")
+    def check(dataset):
+        click.echo(dataset)
+
+    refused = CliRunner().invoke(check, arguments)
+    assert refused.exit_code == 2
+    assert text in refused.stderr
+    assert CliRunner().invoke(check, ["--dataset", "lmo"]).output == "lmo\n"
+    assert "Usage: check [OPTIONS]" in CliRunner().invoke(check, ["--help"]).output

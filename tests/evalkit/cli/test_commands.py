@@ -32,7 +32,7 @@ def test_help_has_examples(command):
 
 
 def test_a_sound_dataset_and_file_pass(work):
-    result = run("check", "toys", "truth.csv", "--json", "check.json")
+    result = run("check", "--dataset", "toys", "--results", "truth.csv", "--json", "check.json")
     assert result.exit_code == 0, result.output
     assert "error" not in result.output
     assert (
@@ -46,13 +46,39 @@ def test_a_sound_dataset_and_file_pass(work):
     }
 
 
+def test_a_check_takes_the_dataset_of_the_sidecars_and_refuses_the_arguments_of_earlier_versions(work):
+    result = run("check")
+    assert result.exit_code == 0, result.output
+    assert "result files 1, estimates 6" in result.output
+    assert "result files" not in run("check", "--dataset", "toys").output
+    refused = run("check", "toys", "truth.csv")
+    assert refused.exit_code == 2
+    assert "check ... toys truth.csv is now check ... --dataset toys --results truth.csv" in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("folders", "text"),
+    [
+        ((), "`synthgen render --object MESH --n N` and then `refinenet train shards/`"),
+        (("shards",), "make some with `refinenet train shards/` or `refinenet refine`"),
+    ],
+)
+def test_a_report_of_nothing_names_the_command_that_makes_what_is_missing(tmp_path, monkeypatch, folders, text):
+    monkeypatch.chdir(tmp_path)
+    for folder in folders:
+        (tmp_path / folder).mkdir()
+    result = run("report")
+    assert result.exit_code == 2
+    assert text in result.stderr and len(result.stderr.splitlines()) == 1
+
+
 def test_a_scaled_rotation_is_named_with_its_line(work):
     lines = (work / "truth.csv").read_text().splitlines()
     fields = lines[2].split(",")
     fields[4] = "2 0 0 0 2 0 0 0 2"
     lines[2] = ",".join(fields)
     (work / "bad.csv").write_text("\n".join(lines) + "\n")
-    result = run("check", "toys", "bad.csv")
+    result = run("check", "--dataset", "toys", "--results", "bad.csv")
     assert result.exit_code == 1
     assert "bad.csv:3: R is scaled by 2" in result.output
 
@@ -63,7 +89,7 @@ def test_metres_are_recognised(work):
     for fields in rows:
         fields[5] = " ".join(str(float(value) / 1000) for value in fields[5].split())
     (work / "bad.csv").write_text("\n".join([head, *(",".join(fields) for fields in rows)]) + "\n")
-    result = run("check", "toys", "bad.csv")
+    result = run("check", "--dataset", "toys", "--results", "bad.csv")
     assert "metres" in result.output
 
 

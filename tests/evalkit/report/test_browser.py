@@ -64,6 +64,29 @@ def test_a_page_opens_without_a_complaint_at_any_width(browser, pages, which, wi
     assert browser.evaluate("document.querySelectorAll('svg').length") > 0 or which == 1
 
 
+def test_no_table_scrolls_sideways_on_a_usual_screen(browser, pages):
+    browser.open(pages[0], 1280)
+    browser.evaluate("document.querySelectorAll('details').forEach(details => details.open = true)")
+    widths = browser.evaluate(
+        "[...document.querySelectorAll('.scroll')].map(e => [e.ariaLabel, e.scrollWidth, e.clientWidth])"
+    )
+    assert len(widths) > 12
+    assert [line for line in widths if line[1] > line[2]] == []
+
+
+def test_pictures_and_plots_come_before_words_and_words_before_tables(browser, pages):
+    browser.open(pages[0])
+    tops = [
+        browser.evaluate(f"document.querySelector('main {part}').getBoundingClientRect().top")
+        for part in ("article.case img", ".plots svg", ".words", "table")
+    ]
+    assert tops == sorted(tops)
+    assert tops[0] < 500  # on the first screen
+    headings = browser.evaluate("[...document.querySelectorAll('main section:first-of-type h3')].map(h => h.innerText)")
+    assert [text.split(":")[0] for text in headings if not text.startswith("Scene")] == ["Typical", "Worst"]
+    assert browser.evaluate("document.querySelectorAll('main section:first-of-type article').length") == 6
+
+
 def test_a_click_on_a_heading_sorts_and_another_turns_it_round(browser, pages):
     browser.open(pages[0])
     last = f"[...{TABLE}.querySelectorAll('{BODY}')].map(row => ({NUMBER})([...row.cells].at(-1)))"

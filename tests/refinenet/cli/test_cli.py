@@ -32,6 +32,10 @@ def test_train_command(cli, dataset, tmp_path):
     assert "initial  refined" in result.stdout
     assert "of step 2: last.safetensors, and best.safetensors too" in result.stdout
     assert str(out / "best.safetensors") in result.stdout
+    last = result.stdout.splitlines()[-1]
+    assert last.startswith(
+        f"{dataset}: no test images, so nothing is refined for a report; on your own images: refinenet"
+    )
     again = cli("train", dataset, "--out", out, *SMALL)
     assert again.exit_code == 2
     assert "already holds a run" in again.stderr

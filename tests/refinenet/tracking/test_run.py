@@ -25,7 +25,7 @@ def test_a_job_writes_the_files_of_the_command(cli, job, tmp_path):
     assert (summary.log.frames, summary.not_reached, summary.stopped) == (FRAMES, 0, None)
     out = tmp_path / "command" / "track.csv"
     options = ["--checkpoint", job.method.checkpoint, "--init", job.init, "--out", out, "--device", "cpu"]
-    result = cli("track", job.source, *options, "--threads", 1, "--quiet")
+    result = cli("track", "--dataset", job.source, *options, "--threads", 1, "--quiet")
     assert result.exit_code == 0, result.output
     assert columns(job.out) == columns(out)
     assert read_sidecar(job.out) == read_sidecar(out)
@@ -58,6 +58,6 @@ def test_settings_without_effect_are_refused(job):
 
 @pytest.mark.parametrize(("old", "new"), [("--sure", "--tracking-threshold"), ("--found", "--accept-threshold")])
 def test_old_options_are_refused_with_the_new_name(cli, job, old, new):
-    result = cli("track", job.source, "--init", job.init, "--out", job.out, old, 0.5)
+    result = cli("track", "--dataset", job.source, "--init", job.init, "--out", job.out, old, 0.5)
     assert result.exit_code == 2
     assert f"{old} is now {new}" in result.stderr

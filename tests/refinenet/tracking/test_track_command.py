@@ -40,7 +40,7 @@ def test_a_bop_scene_with_a_gap(cli, scene, still, tmp_path):
     root, truths = scene
     out, video = tmp_path / "track.csv", tmp_path / "track.mp4"
     result = cli(
-        "track", root, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--video", video,
+        "track", "--dataset", root, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--video", video,
         "--patience", 3, "--quiet",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -97,7 +97,7 @@ def test_a_baseline_tracks_without_a_checkpoint(cli, scene, tmp_path, method):
     root, truths = scene
     out = tmp_path / "track.csv"
     options = ["--method", method, "--init", root / "start.csv", "--out", out, "--iterations", 2, "--quiet"]
-    result = cli("track", root, *options)
+    result = cli("track", "--dataset", root, *options)
     assert result.exit_code == 0, result.output
     found = {estimate.im_id: estimate.T_cam_obj for estimate in read_results(out, BopDataset(root))}
     assert set(range(4)) <= set(found)
@@ -116,11 +116,23 @@ def test_search_is_believed_where_it_does_not_fail(cli, scene, tmp_path, monkeyp
     monkeypatch.setattr(GradientSearch, "_refine", found)
     root, _ = scene
     out = tmp_path / "track.csv"
-    result = cli("track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--quiet")
+    result = cli(
+        "track", "--dataset", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--quiet"
+    )
     assert result.exit_code == 0, result.output
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
     result = cli(
-        "track", root, "--method", "search", "--init", root / "start.csv", "--out", out, "--tracking-threshold", 0.5
+        "track",
+        "--dataset",
+        root,
+        "--method",
+        "search",
+        "--init",
+        root / "start.csv",
+        "--out",
+        out,
+        "--tracking-threshold",
+        0.5,
     )
     assert read_sidecar(out)["states"]["lost"] == FRAMES
     assert "No pose, 3 times: the best pose has a confidence of 0.42" in result.stderr
@@ -148,7 +160,7 @@ def test_a_symmetric_object_does_not_spin_when_it_is_found_again(cli, bobbin_ply
     write(tmp_path / "start.csv", [Estimate(scene_id=1, im_id=i, obj_id=1, T_cam_obj=T) for i, T in offered.items()])
     checkpoint_file = still_checkpoint(tmp_path / "still.safetensors", mesh)
     options = ["--init", tmp_path / "start.csv", "--out", tmp_path / "track.csv", "--patience", 1, "--quiet"]
-    result = cli("track", tmp_path / "bop", "--checkpoint", checkpoint_file, *options)
+    result = cli("track", "--dataset", tmp_path / "bop", "--checkpoint", checkpoint_file, *options)
     assert result.exit_code == 0, result.output
     assert [reset["im_id"] for reset in read_sidecar(tmp_path / "track.csv")["resets"]] == [0, 5]
     poses = [estimate.T_cam_obj for estimate in read_results(tmp_path / "track.csv")]
@@ -173,7 +185,7 @@ def test_the_shipped_flow_network_follows_a_turning_object(cli, repository, tug_
     write(tmp_path / "start.csv", [Estimate(scene_id=1, im_id=0, obj_id=1, T_cam_obj=start)])
     network = repository / "examples" / "checkpoints" / "tug_flow.safetensors"
     options = ["--init", tmp_path / "start.csv", "--out", tmp_path / "track.csv", "--threads", 1, "--quiet"]
-    result = cli("track", tmp_path / "bop", "--checkpoint", network, *options)
+    result = cli("track", "--dataset", tmp_path / "bop", "--checkpoint", network, *options)
     assert result.exit_code == 0, result.output
     sidecar = read_sidecar(tmp_path / "track.csv")
     assert sidecar["settings"]["depth_step"] == 0
@@ -242,37 +254,43 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
     init, pose, camera = ["--init", root / "start.csv"], ["--pose", root / "pose.json"], ["--camera", root / "cam.json"]
     for arguments, code, text in (
         ([tmp_path / "none", *init], 1, "no such folder or file"),
-        ([root, *init, "--scene", 7], 1, "no scene 7"),
-        ([root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
+        (["--dataset", root, *init, "--scene", 7], 1, "no scene 7"),
+        (["--dataset", root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
         ([images, *pose], 2, "need --camera"),
         ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "found no numbers fx, fy, cx, cy"),
         ([images, *pose, *camera], 2, "object 1 has an initial pose and no mesh; give its file with --mesh"),
         ([tmp_path / "empty", *pose, *camera], 1, "no images"),
+        ([root, *init], 2, f"track {root} is now track --dataset {root}"),
+        (["--dataset", images, *init], 2, "found no models folder in it, expected a BOP dataset"),
+        (["--dataset", root, images, *init], 2, "give SOURCE, a folder of images or a video file, or else --dataset"),
         ([tmp_path / "no.mp4", *pose, *camera], 1, "cannot open it as a video"),
         (
-            [root, *init, "--tracking-threshold", 0.2, "--accept-threshold", 0.4],
+            ["--dataset", root, *init, "--tracking-threshold", 0.2, "--accept-threshold", 0.4],
             2,
             "expected 0 <= accept_threshold <= tr",
         ),
-        ([root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
-        ([root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
-        ([root, *init, *camera], 2, "--camera is for images and videos"),
-        ([root, *init, "--fps", 10], 2, "--fps has no effect without --video; leave it out"),
+        (["--dataset", root, *init, "--video", tmp_path / "film.xyz"], 1, "choose a name ending in .mp4 or .avi"),
+        (["--dataset", root, *init, "--method", "edge-icp"], 2, "--method edge-icp takes no --checkpoint"),
+        (["--dataset", root, *init, *camera], 2, "--camera is for images and videos"),
+        (["--dataset", root, *init, "--fps", 10], 2, "--fps has no effect without --video; leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
         ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t_z of 0.5 is probably in metres"),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
         ([tmp_path / "twins", *pose, *camera], 1, "01.png and 1.png have one number"),
-        ([root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),
+        (["--dataset", root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),
     ):
         result = cli("track", *arguments, "--checkpoint", still, "--out", tmp_path / "x.csv", "--quiet")
         assert result.exit_code == code, result.output
         assert text in result.stderr, result.stderr
         assert "Traceback" not in result.output
         assert len([line for line in result.stderr.splitlines() if line.startswith("Error: ")]) == 1
-    assert cli("track", root, "--checkpoint", still, "--out", tmp_path / "x.csv").exit_code == 2
-    assert "needs a --checkpoint" in cli("track", root, *init, "--out", tmp_path / "x.csv").stderr
+    assert cli("track", "--dataset", root, "--checkpoint", still, "--out", tmp_path / "x.csv").exit_code == 2
+    assert "needs a --checkpoint" in cli("track", "--dataset", root, *init, "--out", tmp_path / "x.csv").stderr
     edges = ["--method", "edge-icp", "--allow-other-mesh", "--out", tmp_path / "x.csv"]
-    assert "--allow-other-mesh has no effect for --method edge-icp" in cli("track", root, *init, *edges).stderr
+    assert (
+        "--allow-other-mesh has no effect for --method edge-icp"
+        in cli("track", "--dataset", root, *init, *edges).stderr
+    )
     (tmp_path / "none.json").write_text("[]")
     shutil.copy(root / "pose.json", tmp_path / "x.json")
     for arguments, text in (
@@ -288,7 +306,7 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         ),
         (["--method", "edge-icp", "--pose", tmp_path / "x.json"], "the sidecar of --out and --pose are both"),
     ):
-        result = cli("track", root, *arguments, "--out", tmp_path / "x", "--quiet")
+        result = cli("track", "--dataset", root, *arguments, "--out", tmp_path / "x", "--quiet")
         assert (result.exit_code, text in result.stderr) == (2, True), result.output
     assert json.loads((tmp_path / "x.json").read_text()) == json.loads((root / "pose.json").read_text())
 
@@ -304,7 +322,7 @@ def test_search_is_asked_for_what_is_found(cli, scene, tmp_path, monkeypatch):
     root, _ = scene
     out = tmp_path / "track.csv"
     options = ["--method", "search", "--init", root / "start.csv", "--out", out, "--quiet", "--tracking-threshold", 0.2]
-    assert cli("track", root, *options, "--accept-threshold", 0.1).exit_code == 0
+    assert cli("track", "--dataset", root, *options, "--accept-threshold", 0.1).exit_code == 0
     assert set(asked) == {0.1}
     assert read_sidecar(out)["states"]["tracking"] == FRAMES
 
@@ -316,7 +334,9 @@ def test_a_run_that_stops_early_says_how_much_it_did_not_reach(cli, scene, still
     images = sorted((copy / "test" / "000001" / "rgb").iterdir())
     images[3].write_bytes(b"damaged")
     out = tmp_path / "track.csv"
-    result = cli("track", copy, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--quiet")
+    result = cli(
+        "track", "--dataset", copy, "--checkpoint", still, "--init", root / "start.csv", "--out", out, "--quiet"
+    )
     assert result.exit_code == 1
     assert read_sidecar(out)["not_reached"] == FRAMES - 3
 

@@ -111,6 +111,74 @@ def test_render_and_preview(tug_ply, tmp_path, small_set):
     assert "no rendered sample from 5 on" in error_line(result)
 
 
+def test_a_preview_is_spread_over_scenes(tug, config_of, tmp_path, monkeypatch):
+    from small_datasets import write_dataset
+    from synthgen.inspect import preview
+
+    write_dataset(tmp_path / "shards", config_of("hypotheses_per_scene=4", "shard_size=8"), {1: tug}, 24)
+    shown = []
+    monkeypatch.setattr(preview, "sample_row", lambda sample, index: shown.append(index) or preview.title_row())
+
+    def indices(count, first=None):
+        shown.clear()
+        preview.contact_sheet(str(tmp_path / "shards"), count, first=first)
+        return list(shown)
+
+    assert indices(6) == [0, 4, 8, 12, 16, 20]  # one of each scene
+    assert indices(3) == [0, 8, 16]
+    assert indices(8) == [0, 1, 4, 8, 12, 13, 16, 20]  # more than scenes: further hypotheses of some
+    assert indices(100) == list(range(24))
+    assert indices(4, first=6) == [6, 7, 8, 9]
+    result = invoke("preview", tmp_path / "shards", "--out", tmp_path / "sheet.png", "--count", 2)
+    assert result.stderr.splitlines()[0] == "tug.ply: diameter 118.9 mm"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (("cut", "images", "--out", "a"), "cut ... images is now cut ... --dataset images"),
+        (("export", "shards", "out.h5"), "export ... out.h5 is now export ... --out out.h5"),
+        (("info",), "give SHARDS, or --dataset DIR"),
+        (("info", "shards", "--dataset", "images"), "give SHARDS, or --dataset DIR"),
+        (("info", "--dataset", "nowhere"), "--dataset nowhere: expected a dataset of `synthgen bop`"),
+    ],
+)
+def test_a_bop_dataset_has_its_option_and_shards_are_an_argument(arguments, text):
+    result = invoke(*arguments)
+    assert result.exit_code == 2
+    assert text in result.stderr
+
+
+def test_every_option_for_a_dataset_has_one_name():
+    """Shards are the argument SHARDS, images in BOP layout the option --dataset, in every program."""
+    from evalkit.cli import main as evalkit
+    from refinenet.cli import main as refinenet
+
+    reading = {
+        "evalkit": {name for name, command in evalkit.commands.items() if "--dataset" in options(command)},
+        "refinenet": {name for name, command in refinenet.commands.items() if "--dataset" in options(command)},
+        "synthgen": {name for name, command in main.commands.items() if "--dataset" in options(command)},
+    }
+    assert reading["evalkit"] == set(evalkit.commands)
+    assert reading["refinenet"] == {"refine", "track"}
+    assert reading["synthgen"] == {"cut", "info"}
+    shards = {
+        name
+        for program in (main, refinenet)
+        for name, command in program.commands.items()
+        if any(p.name == "shards" and p.param_type_name == "argument" for p in command.params)
+    }
+    assert shards == {"export", "info", "merge", "preview", "train", "verify"}
+    for program in (main, refinenet, evalkit):
+        for command in program.commands.values():
+            names = {p.name for p in command.params if p.param_type_name == "argument"}
+            assert names <= {"shards", "source", "a", "b", "renamed"}, command.name
+
+
+def options(command):
+    return {option for parameter in command.params for option in parameter.opts}
+
+
 @pytest.mark.slow
 def test_bop_renders_frames(tug_ply, tmp_path, small_set):
     result = invoke("bop", "--object", tug_ply, "--frames", 1, "--out", tmp_path / "bop", *small_set)
@@ -137,7 +205,7 @@ def test_a_mended_setting_may_use_the_folder_of_a_run_that_never_began(tug_ply, 
 def test_an_export_that_would_replace_something_says_so_at_once(tmp_path):
     there = tmp_path / "out.h5"
     there.write_text("mine")
-    result = invoke("export", tmp_path / "shards", there)
+    result = invoke("export", tmp_path / "shards", "--out", there)
     assert result.exit_code == 1
     assert "add --overwrite to replace it" in error_line(result)
     assert there.read_text() == "mine"

@@ -57,7 +57,7 @@ def test_the_default_preset_has_no_changed_keys():
 def test_a_bop_folder_has_a_card_too(tug_ply, tmp_path, small_set):
     arguments = ["bop", "--object", str(tug_ply), "--frames", "1", "--out", str(tmp_path / "bop"), *small_set]
     assert CliRunner().invoke(main, arguments).exit_code == 0
-    result = CliRunner().invoke(main, ["info", str(tmp_path / "bop")])
+    result = CliRunner().invoke(main, ["info", "--dataset", str(tmp_path / "bop")])
     assert result.exit_code == 0, result.output
     assert "BOP dataset" in result.stdout
     assert "tug.ply" in result.stdout

@@ -381,7 +381,7 @@ def test_workers_do_not_change_a_byte(images, tmp_path):
     cut_to(tmp_path / "one", images, CutConfig(**SMALL))
     planned = cut_plan.plan(images, CutConfig(**SMALL))
     assert planned.n > 2 * SMALL["shard_size"]
-    command = ["cut", str(images.root), "--patch-px", "64", "--hypotheses-per-pose", "2", "--workers", "2"]
+    command = ["cut", "--dataset", str(images.root), "--patch-px", "64", "--hypotheses-per-pose", "2", "--workers", "2"]
     settings = ["contour_points=20", "shard_size=4", "perturbation.max_angle_deg=15"]
     settings = [word for s in (*settings, "perturbation.max_translation_diameter=0.1") for word in ("--set", s)]
     result = CliRunner().invoke(main, [*command, *settings, "--out", str(tmp_path / "two"), "--quiet"])
@@ -435,7 +435,16 @@ def test_wrong_inputs_are_one_line_each(images, own, tmp_path):
 @pytest.mark.slow
 def test_from_the_command_line(images, tmp_path):
     settings = ["--patch-px", "64", "--set", "contour_points=20", "--hypotheses-per-pose", "1", "--seed", "3"]
-    arguments = ["cut", str(images.root), "--out", str(tmp_path / "shards"), *settings, "--set", "min_visible=0.5"]
+    arguments = [
+        "cut",
+        "--dataset",
+        str(images.root),
+        "--out",
+        str(tmp_path / "shards"),
+        *settings,
+        "--set",
+        "min_visible=0.5",
+    ]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.output
     n = ShardReader(str(tmp_path / "shards")).n
@@ -451,10 +460,10 @@ def test_from_the_command_line(images, tmp_path):
     assert set(models) == {"1", "4"}
     shutil.copytree(images.split_path, tmp_path / "two" / "test")
     shutil.copytree(images.split_path, tmp_path / "two" / "train")
-    unsure = CliRunner().invoke(main, ["cut", str(tmp_path / "two"), "--out", str(tmp_path / "x")])
+    unsure = CliRunner().invoke(main, ["cut", "--dataset", str(tmp_path / "two"), "--out", str(tmp_path / "x")])
     assert unsure.exit_code == 2
     assert "has the splits test, train: choose with --split" in unsure.output
-    failed = CliRunner().invoke(main, ["cut", str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")])
+    failed = CliRunner().invoke(main, ["cut", "--dataset", str(tmp_path / "nowhere"), "--out", str(tmp_path / "x")])
     assert failed.exit_code == 1
     assert "no such folder" in failed.output
     assert not (tmp_path / "x").exists()

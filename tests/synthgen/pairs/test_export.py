@@ -35,8 +35,8 @@ def stored(shards):
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, ["export", "--quiet", *map(str, arguments)])
+def run(shards, out, *arguments):
+    return CliRunner().invoke(main, ["export", "--quiet", str(shards), "--out", str(out), *map(str, arguments)])
 
 
 @pytest.mark.slow

@@ -160,6 +160,25 @@ def renamed_options(renamed: Mapping[str, str]) -> Callable[[F], F]:
     return decorate
 
 
+def renamed_arguments(*options: str) -> Callable[[F], F]:
+    """Refuse positional arguments of earlier versions: "check lmo a.csv is now check --dataset lmo --results a.csv".
+
+    Goes below the arguments that the command still has.
+
+    Args:
+        options: New option of each old argument; further ones have the last option.
+    """
+
+    def refuse(ctx: click.Context, _: click.Parameter, values: tuple[str, ...]) -> None:
+        if values and not ctx.resilient_parsing:
+            new = [f"{options[min(i, len(options) - 1)]} {value}" for i, value in enumerate(values)]
+            raise click.UsageError(
+                f"{ctx.info_name} ... {' '.join(values)} is now {ctx.info_name} ... {' '.join(new)}", ctx
+            )
+
+    return click.argument("renamed", nargs=-1, metavar="", is_eager=True, expose_value=False, callback=refuse)
+
+
 @contextmanager
 def stoppable(kept: Callable[[], str | None]) -> Iterator[None]:
     """End Ctrl-C with one line and exit code 130.

@@ -4,13 +4,20 @@ import sys
 from pathlib import Path
 
 import click
+from posecore.command_line import renamed_arguments
 
 from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 
 
 @click.command()
-@click.argument("dataset", type=FOLDER)
-@click.argument("results", nargs=-1, type=FOLDER)
+@click.option("--dataset", type=FOLDER, help="BOP dataset folder. Default: the one the results' sidecars name.")
+@click.option(
+    "--results",
+    multiple=True,
+    type=FOLDER,
+    help="BOP result file; repeat it. Default: none with --dataset, else all with a sidecar.",
+)
+@renamed_arguments("--dataset", "--results")
 @split_option
 @click.option("--sensor", help="Camera of several, such as cam1; rgb,gray1 where scenes differ.")
 @click.option("--samples", type=click.IntRange(0), default=100, help="Images to decode, spread evenly.")
@@ -20,7 +27,7 @@ from evalkit.cli.options import FOLDER, NEW_FILE, split_option, verbose_option
 @click.pass_context
 def check(
     ctx: click.Context,
-    dataset: Path,
+    dataset: Path | None,
     results: tuple[Path, ...],
     split: str | None,
     sensor: str | None,
@@ -36,14 +43,18 @@ def check(
 
     \b
     Examples:
-      evalkit check lmo
-      evalkit check lmo results/quick.csv --all --json check.json
-      evalkit check xyzibd results.csv --split test --sensor xyz --samples 500
+      evalkit check --dataset lmo
+      evalkit check --dataset lmo --results results/quick.csv --all --json check.json
+      evalkit check --dataset xyzibd --results results.csv --split test --sensor xyz --samples 500
     """
     from posecore.files import write_atomic
 
     from evalkit.check.run import check as run_checks
+    from evalkit.inputs.result_files import dataset_of, find_result_files
 
+    if dataset is None:
+        results = results or tuple(find_result_files(Path()))
+        dataset = dataset_of(results, Path())
     findings = run_checks(
         dataset,
         results,

@@ -59,7 +59,8 @@ def perturb(
       evalkit perturb --dataset lmo --out curve.csv --angles 5,10,15,30,45 --translations 0.1,0.5,1
       evalkit perturb --dataset lm --out curve.csv --protocol paper
     """
-    from evalkit.inputs.pairing import Level
+    from posecore.bop.perturbation import Level
+
     from evalkit.inputs.perturbation import PROTOCOLS, PerturbJob, write_initial_poses
 
     limit = None

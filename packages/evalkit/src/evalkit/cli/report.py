@@ -1,7 +1,7 @@
 """`evalkit report`."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,9 @@ from evalkit.cli.options import FOLDER, split_option, verbose_option, vss_option
 @split_option
 @vss_option
 @workers_option
-@click.option("--worst", type=click.IntRange(0, 200), default=12, help="Pictures of worst cases.")
+@click.option(
+    "--worst", type=click.IntRange(0, 200), default=12, help="Worst cases with pictures; 0 leaves out all pictures."
+)
 @verbose_option
 def report(
     dataset: Path | None,
@@ -53,10 +55,23 @@ def report(
 
         made = make_report(job, on_file)
     for item in made.summary["against_initial"]:
-        click.echo(item["words"])
+        for line in _change_lines(item):
+            click.echo(line)
     for file in made.summary["files"]:
         click.echo(_total_line(file))
     click.echo(f"Report: {made.page}")
+
+
+def _change_lines(compared: dict[str, Any]) -> Iterator[str]:
+    """The change of a file in lines: all of it, what is better or worse, each score."""
+    from evalkit.report.comparison import interval_words
+
+    yield compared["headline"]
+    if compared["verdict"]:
+        yield f"  {compared['verdict']}"
+    yield from (f"  {change}" for change in compared["changes"])
+    if compared["changes"]:
+        yield f"  {interval_words(compared)}"
 
 
 def _total_line(file: dict[str, Any]) -> str:

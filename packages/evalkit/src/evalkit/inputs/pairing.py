@@ -6,20 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
-from posecore.errors import DatasetError, ResultFileError
+from posecore.bop import BopDataset, Estimate, GroundTruth
+from posecore.bop.perturbation import Level, instances_of
+from posecore.errors import ResultFileError
 
 from evalkit.inputs.result_files import ResultFile
 
 Key = tuple[int, int, int]
-
-
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """Perturbation of an initial pose: its distance from the ground truth."""
-
-    angle_deg: float
-    translation_diameter: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -39,22 +32,6 @@ class Pairing:
 
     pairs: list[MatchedPose]
     ignored: int
-
-
-def instances_of(dataset: BopDataset, target: BopTarget) -> list[GroundTruth]:
-    """Annotated instances of a target with a pose, the most visible first.
-
-    Raises:
-        DatasetError: there is none.
-    """
-    instances = [gt for gt in dataset.gt(target.scene_id, target.im_id) if gt.obj_id == target.obj_id and gt.has_pose]
-    if not instances:
-        scene = dataset.scene_path(target.scene_id)
-        raise DatasetError(
-            f"{scene / 'scene_gt.json'}: image {target.im_id} has no pose of object {target.obj_id}, "
-            "which the targets ask for"
-        )
-    return sorted(instances, key=lambda gt: -(1.0 if gt.visib_fract is None else gt.visib_fract))
 
 
 def pair_up(dataset: BopDataset, result: ResultFile) -> Pairing:

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from posecore.bop import BopDataset, Estimate, read_results, read_sidecar, sidecar_path
+from posecore.bop.perturbation import INITIAL_METHOD
 from posecore.errors import ConfigError, ResultFileError
 from posecore.files import sha256_file
 
 log = logging.getLogger(__name__)
 
-INITIAL_METHOD = "initial"
-"""`method` in the sidecar of a file of initial poses."""
 UNREFINED = "no refinement"
 """Name of the initial poses in tables, as in the 2018 paper's."""
 
@@ -65,9 +64,16 @@ def find_result_files(folder: Path, is_dataset_given: bool = False) -> list[Path
     if not with_sidecar:
         raise ConfigError(
             f"{folder.resolve()}: no result file (*.csv with *.csv.json beside it that names a dataset) here or in "
-            "results/; name them with --results FILE.csv --dataset DIR"
+            f"results/; {_command_for_results(folder)}, or name files with --results FILE.csv --dataset DIR"
         )
     return with_sidecar
+
+
+def _command_for_results(folder: Path) -> str:
+    """The commands that make result files, from what a folder holds."""
+    if (folder / "shards").is_dir():
+        return "make some with `refinenet train shards/` or `refinenet refine`"
+    return "make some with `synthgen render --object MESH --n N` and then `refinenet train shards/`"
 
 
 def dataset_of(paths: Sequence[Path], folder: Path) -> Path:

@@ -33,7 +33,7 @@ class ReportJob:
         dataset: BOP folder with ground truth; by default the one that the sidecars name.
         split: of the dataset.
         vss: VSS of whole silhouettes or of visible parts.
-        worst: number of worst cases shown as pictures.
+        worst: number of worst cases shown as pictures; 0 shows no case.
         workers: number of processes that score poses; the numbers do not depend on it.
     """
 

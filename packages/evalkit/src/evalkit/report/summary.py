@@ -84,15 +84,14 @@ def initial_of(item: Scored, initial: Sequence[Scored]) -> Scored:
     return [*named, *initial][0]
 
 
-def worst_cases(scored: Sequence[Scored], count: int) -> list[CaseKey]:
-    """Keys of the lowest VSS among the found poses of the last result file, lowest first."""
+def ranked_cases(scored: Sequence[Scored]) -> list[CaseKey]:
+    """Keys of the poses found in the last result file, by rising VSS."""
     if not scored:
         return []
     table = scored[-1].table
     vss, angle = column(table, "vss"), column(table, "re_sym_rad")
     cases = [(key, row) for key, row in scored[-1].cases().items() if table.found.iloc[row]]
-    ordered = sorted(cases, key=lambda item: (vss[item[1]], -angle[item[1]]))
-    return [key for key, _ in ordered[:count]]
+    return [key for key, _ in sorted(cases, key=lambda item: (vss[item[1]], -angle[item[1]]))]
 
 
 def bins_of(table: pd.DataFrame, distance_edges_m: Sequence[float]) -> dict[str, list[dict[str, Any]]]:

@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
+from posecore.bop.perturbation import instances_of
 from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
 
-from evalkit.inputs.pairing import instances_of
 from evalkit.inputs.result_files import ResultFile
 
 

@@ -13,6 +13,8 @@ from posecore.store import Store
 
 MANIFEST = "manifest.jsonl"
 GROUP = "zarr.json"
+TEST_SET = "test_bop"
+"""Folder in a local dataset with its test images, a BOP dataset of other scenes."""
 
 
 def n_shards(card: Mapping[str, Any]) -> int:

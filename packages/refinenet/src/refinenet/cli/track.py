@@ -33,7 +33,8 @@ SHOWN_REASONS = 3
 
 
 @click.command()
-@click.argument("source", type=FILE)
+@click.argument("source", type=FILE, required=False)
+@click.option("--dataset", type=FILE, metavar="DIR", help="BOP dataset with the images, instead of SOURCE.")
 @method_option
 @checkpoint_option
 @click.option("--out", required=True, type=NEW_FILE, metavar="CSV", help="Poses, a BOP result file.")
@@ -80,7 +81,8 @@ SHOWN_REASONS = 3
 @verbose_option
 @renamed_options({"--sure": "--tracking-threshold", "--found": "--accept-threshold"})
 def track(
-    source: Path,
+    source: Path | None,
+    dataset: Path | None,
     method: MethodName,
     checkpoint: Path | None,
     out: Path,
@@ -106,17 +108,18 @@ def track(
     allow_other_mesh: bool,
     quiet: bool,
 ) -> None:
-    """Track objects through SOURCE: a scene of a BOP dataset, a folder of images, or a video file.
+    """Track objects through SOURCE, a folder of images or a video file, or through a scene of a BOP dataset.
 
     The poses of each frame start the refinement of the next. An object is tracking, uncertain, or lost; a lost object
     has no pose in the result file until an initial pose of --init or --pose fits, or it is found at its last pose.
 
     \b
-    refinenet track choi --scene 1 --checkpoint best.safetensors --init start.csv --out results/track.csv
-    refinenet track choi --scene 1 --method edge-icp --init start.csv --out results/edges.csv
+    refinenet track --dataset choi --scene 1 --checkpoint best.safetensors --init start.csv --out results/track.csv
+    refinenet track --dataset choi --scene 1 --method edge-icp --init start.csv --out results/edges.csv
     refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
         --out track.csv --video annotated.mp4
     """
+    frames = _frames(source, dataset)
     settings = MethodSettings(
         method=method, checkpoint=checkpoint, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh
     )
@@ -124,13 +127,20 @@ def track(
     if video is None:
         require_used("without --video", "fps")
     require_distinct_files(
-        {"SOURCE": source, "--init": init, "--pose": pose, "--camera": camera, "--checkpoint": checkpoint},
+        {
+            "SOURCE": source,
+            "--dataset": dataset,
+            "--init": init,
+            "--pose": pose,
+            "--camera": camera,
+            "--checkpoint": checkpoint,
+        },
         {"--out": out, "--video": video},
     )
     from refinenet.tracking.run import TrackJob, track_to_file
 
     job = TrackJob(
-        method=settings, source=source, out=out, init=init, pose=pose, split=split, scene=scene, camera=camera,
+        method=settings, source=frames, out=out, init=init, pose=pose, split=split, scene=scene, camera=camera,
         mesh_files=mesh_files, units=units, objects=objects, motion_model=motion_model,
         tracking_threshold=tracking_threshold, accept_threshold=accept_threshold, patience=patience,
         depth_step=depth_step, video=video, fps=fps, name=name, threads=threads,
@@ -146,6 +156,21 @@ def track(
     _print(job, summary)
     if summary.stopped is not None:
         end_early(summary.stopped, f"what was tracked is in {out}")
+
+
+def _frames(source: Path | None, dataset: Path | None) -> Path:
+    """The folder or file with the frames."""
+    from refinenet.tracking.frame_sources import is_bop_dataset
+
+    if source is None and dataset is not None:
+        if dataset.exists() and not is_bop_dataset(dataset):
+            raise click.UsageError(f"--dataset {dataset}: found no models folder in it, expected a BOP dataset")
+        return dataset
+    if source is None or dataset is not None:
+        raise click.UsageError("give SOURCE, a folder of images or a video file, or else --dataset DIR")
+    if is_bop_dataset(source):
+        raise click.UsageError(f"track {source} is now track --dataset {source}, since it is a BOP dataset")
+    return source
 
 
 def _print(job: "TrackJob", summary: "TrackSummary") -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, get_args
 
 import click
-from posecore.command_line import progress_bar, stoppable
+from posecore.command_line import end_early, progress_bar, stoppable
 
 from refinenet.cli.options import FILE, quiet_option, verbose_option
-from refinenet.config import DeviceName, LossName, PresetName
+from refinenet.config import DeviceName, LossName, PresetName, TrainConfig
 
 log = logging.getLogger(__name__)
 
@@ -74,9 +74,12 @@ def train(
 ) -> None:
     """Train on SHARDS, a dataset made by `synthgen render` (folder or fsspec URL).
 
-    Writes best.safetensors, last.safetensors, metrics.jsonl, TensorBoard events and config.yaml.
+    Writes best.safetensors, last.safetensors, metrics.jsonl, TensorBoard events and config.yaml to --out. At its end,
+    poses in the test images of SHARDS, which it never trains on, are perturbed and refined into results/ of the working
+    folder, for `evalkit report`.
 
     \b
+    refinenet train shards/
     refinenet train shards/ --steps 4000
     refinenet train shards/ --preset paper --backbone-weights inception_v4.safetensors --out runs/benchvise
     refinenet train shards/ --set hypothesis.max_angle_deg=40 --set optimiser.lr=3e-4
@@ -109,6 +112,31 @@ def train(
         for line in (*_comparison(errors), *_checkpoints(folder, config.steps)):
             click.echo(line)
         click.echo(f"{folder / 'best.safetensors'}")
+        _refine_test_set(shards, folder, config, quiet)
+
+
+def _refine_test_set(shards: str, folder: Path, config: TrainConfig, quiet: bool) -> None:
+    """Refine perturbed poses in the dataset's test images, or print in one line the reason for none."""
+    from refinenet.refine.test_set import TestSetJob, find_test_set, refine_test_set
+
+    images = find_test_set(shards)
+    if isinstance(images, str):
+        click.echo(
+            f"{shards}: {images}, so nothing is refined for a report; on your own images: refinenet refine "
+            f"--checkpoint {folder / 'best.safetensors'} --dataset DIR --init POSES.csv --out results/NAME.csv"
+        )
+        return
+    job = TestSetJob(dataset=images, run=folder, device=config.device, threads=config.threads)
+    again = "the run is complete; with --resume the same command refines its test images"
+    with stoppable(lambda: again), progress_bar(quiet) as bar:
+        task = bar.add_task("test poses", total=None, visible=False)
+        done = refine_test_set(job, lambda count, total: bar.update(task, completed=count, total=total, visible=True))
+    if done is None:
+        click.echo(f"{images}: no image of a trained object, so nothing is refined for a report")
+        return
+    click.echo(done.text)
+    if done.summary.stopped is not None:
+        end_early(done.summary.stopped, again)
 
 
 def _comparison(errors: dict[str, float]) -> Iterator[str]:

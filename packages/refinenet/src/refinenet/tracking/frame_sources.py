@@ -160,6 +160,11 @@ def _refuse_depth(method: PoseRefiner, source: Path) -> None:
         raise DatasetError(f"{source}: images and videos have no depth, which {method.name} needs; give a BOP dataset")
 
 
+def is_bop_dataset(path: Path) -> bool:
+    """Whether a path is taken for a BOP dataset: a folder with a models folder."""
+    return path.is_dir() and any(path.glob("models*"))
+
+
 def open_sequence(source: Path, *, split: str | None, scene: int | None, camera: Path | None) -> FrameSequence:
     """The sequence at a path: a BOP dataset where it has a models folder, else a folder of images or a video file.
 
@@ -176,7 +181,7 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
     """
     if not source.exists():
         raise DatasetError(f"{source}: no such folder or file; give a BOP dataset, a folder of images or a video")
-    if source.is_dir() and any(source.glob("models*")):
+    if is_bop_dataset(source):
         if camera is not None:
             raise ConfigError("--camera is for images and videos; a BOP dataset brings its own cameras")
         dataset = BopDataset(source, split)

@@ -20,12 +20,12 @@ def main() -> None:
     """Render training pairs and test images of an object from its mesh.
 
     \b
-    synthgen render --object mesh.ply --n 20000 --out shards
+    synthgen render --object mesh.ply --n 200000
     synthgen doctor
     synthgen verify shards --report verify.html
     synthgen preview shards --out sheet.png
     synthgen bop --object mesh.ply --frames 50 --out test_bop
-    synthgen cut dataset --split train_real --out shards
+    synthgen cut --dataset images --split train_real --out shards
     """
 
 

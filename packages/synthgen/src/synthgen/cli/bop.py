@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from posecore.command_line import progress_bar
 
-from synthgen.cli.options import resumable, scene_options
+from synthgen.cli.options import echo_lines, required_out, resumable, scene_options
 
 if TYPE_CHECKING:
     from synthgen.bop.frame_maker import Split
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @scene_options
+@required_out
 @click.option(
     "--frames", required=True, type=click.IntRange(1), help="Number of images; with --sequence, per sequence."
 )
@@ -92,5 +93,9 @@ def bop(
     job = BopJob(out=out, plan=plan, config=config, sources=sources, workers=workers)
     with resumable(out), progress_bar(quiet) as bar:
         task = bar.add_task("frames", total=job.frames, visible=False)
-        summary = render_bop_dataset(job, on_frame=lambda scene_id, im_id: bar.update(task, advance=1, visible=True))
+        summary = render_bop_dataset(
+            job,
+            on_objects=echo_lines,
+            on_frame=lambda scene_id, im_id: bar.update(task, advance=1, visible=True),
+        )
     click.echo(summary.text, err=True)

@@ -4,17 +4,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from posecore.command_line import progress_bar
+from posecore.command_line import progress_bar, renamed_arguments
 
-from synthgen.cli.options import OUT, QUIET, resumable
+from synthgen.cli.options import QUIET, required_out, resumable
 
 if TYPE_CHECKING:
     from synthgen.run.cut import CutWork
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
-@OUT
+@click.option(
+    "--dataset",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="BOP dataset with annotated images.",
+)
+@renamed_arguments("--dataset")
+@required_out
 @click.option(
     "--split",
     metavar="NAME",
@@ -53,16 +60,16 @@ def cut(
     quiet: bool,
     **values: int | None,
 ) -> None:
-    """Cut training pairs from the annotated images of DATASET, a folder in BOP layout.
+    """Cut training pairs from the annotated images of a BOP dataset.
 
     For training on real images, or on the errors of a detector or of a refinement, whose result file --hypotheses
     takes. Hidden poses and hypotheses that do not fit into their windows are left out, and counted. Never train on
     images that you report results on.
 
     \b
-    synthgen cut ycbv --split train_real --images 5000 --out shards
-    synthgen cut my_images --out shards --hypotheses detections.csv
-    synthgen cut my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
+    synthgen cut --dataset ycbv --split train_real --images 5000 --out shards
+    synthgen cut --dataset my_images --out shards --hypotheses detections.csv
+    synthgen cut --dataset my_images --out shards --set perturbation.max_angle_deg=20 --patch-px 160
     """
     from synthgen.config import load_cut_config
     from synthgen.run.cut import CutJob, cut_dataset

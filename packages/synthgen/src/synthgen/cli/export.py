@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
-from posecore.command_line import progress_bar
+from posecore.command_line import progress_bar, renamed_arguments
 
 from synthgen.cli.options import QUIET
 
@@ -14,7 +14,14 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("shards", type=str)
-@click.argument("out", type=click.Path(path_type=Path))
+@renamed_arguments("--out")
+@click.option(
+    "--out",
+    required=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE|DIR",
+    help="File of hdf5, folder of webdataset.",
+)
 @click.option(
     "--format",
     "layout",
@@ -22,17 +29,17 @@ if TYPE_CHECKING:
     default="hdf5",
     help="One HDF5 file in the manner of BlenderProc's, or a folder of tars.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace OUT where it exists.")
+@click.option("--overwrite", is_flag=True, help="Replace --out where it exists.")
 @QUIET
 def export(shards: str, out: Path, layout: "Layout", overwrite: bool, quiet: bool) -> None:
-    """Write a complete dataset of SHARDS (folder or URL) as OUT in another container.
+    """Write a complete dataset of SHARDS (folder or URL) in another container.
 
-    OUT appears when it is complete. Values are exactly those of the shards.
+    The output appears when it is complete. Values are exactly those of the shards.
 
     \b
-    synthgen export shards out.h5
-    synthgen export shards tars --format webdataset
-    synthgen export s3://bucket/shards out.h5 --overwrite
+    synthgen export shards --out out.h5
+    synthgen export shards --out tars --format webdataset
+    synthgen export s3://bucket/shards --out out.h5 --overwrite
     """
     from synthgen.pairs.export import export_dataset
 

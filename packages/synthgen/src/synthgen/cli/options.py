@@ -1,7 +1,7 @@
 """Options of several commands, and the scene options that `render` and `bop` share."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,9 +16,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 UNITS = click.Choice(["mm", "cm", "m"])
 ENGINE = click.Choice(ENGINE_NAMES)
 PATH = click.Path(path_type=Path)
-OUT = click.option(
-    "--out", required=True, type=str, metavar="DIR", help="Dataset to write; the same command again continues it."
-)
+_OUT_HELP = "Dataset to write; the same command again continues it."
+required_out = click.option("--out", required=True, type=str, metavar="DIR", help=_OUT_HELP)
+shards_out = click.option("--out", type=str, default="shards", metavar="DIR", help=_OUT_HELP)
 QUIET = click.option("--quiet", is_flag=True, help="No progress bar.")
 
 _SOURCES = (
@@ -44,7 +44,6 @@ _SCENE_OPTIONS = (
         "Repeatable: each scene shows a single object, all equally often. Files named obj_000005.ply keep their "
         "number.",
     ),
-    OUT,
     click.option("--units", type=UNITS, default="mm", help="Unit of the mesh's coordinates."),
     click.option("--engine", type=ENGINE, help="Renderer of the scenes; raster needs no Blender. [preset]"),
     click.option(
@@ -146,6 +145,12 @@ def cluster_options(command: F) -> F:
     for option in reversed(_CLUSTER_OPTIONS):
         wrapped = option(wrapped)
     return wrapped
+
+
+def echo_lines(lines: Sequence[str]) -> None:
+    """Lines on stderr, above a progress bar."""
+    for line in lines:
+        click.echo(line, err=True)
 
 
 def resumable(out: str) -> AbstractContextManager[None]:

@@ -1,5 +1,6 @@
 """`synthgen render`."""
 
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -7,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from posecore.command_line import progress_bar
 
-from synthgen.cli.options import ENGINE, cluster_options, resumable, scene_options
+from synthgen.cli.options import ENGINE, cluster_options, echo_lines, resumable, scene_options, shards_out
 from synthgen.names import DEVICES
 
 if TYPE_CHECKING:
@@ -18,7 +19,15 @@ if TYPE_CHECKING:
 
 @click.command()
 @scene_options
+@shards_out
 @click.option("--n", required=True, type=click.IntRange(1), help="Number of training pairs.")
+@click.option(
+    "--test-images",
+    type=click.IntRange(0),
+    metavar="N",
+    help="Images of other scenes for a report, a BOP dataset in DIR/test_bop; `refinenet train` refines poses in them "
+    "at its end. [a tenth of --n, at most 100; 0 for a URL or with --scheduler]",
+)
 @click.option(
     "--workers",
     type=click.IntRange(1),
@@ -63,17 +72,18 @@ def render(
     certificates: "Certificates | None",
     dashboard: int | None,
     shard_timeout: float | None,
+    test_images: int | None,
     only: int | None,
     save: Path | None,
     **values: Any,
 ) -> None:
-    """Render N training pairs as a sharded Zarr dataset.
+    """Render N training pairs as a sharded Zarr dataset, and some test images of other scenes as a BOP dataset.
 
     A stop at any moment, even kill -9, loses only the shards in progress; the same command again continues and ends
     with the same bytes. A scene that crashes the renderer twice is replaced by another draw, and reported.
 
     \b
-    synthgen render --object mesh.ply --n 200000 --out shards
+    synthgen render --object mesh.ply --n 200000
     synthgen render --object mesh.ply --n 2000 --out draft --engine raster --preset quickstart
     synthgen render --object a.ply --object b.ply --n 50000 --out shards --backgrounds photos/ --workers 8
     synthgen render --object models/ --n 50000 --out many --preset tabletop --hdris hdris/ --occluders clutter/
@@ -85,6 +95,7 @@ def render(
     """
     from synthgen.config import load_config
     from synthgen.run.render import RenderJob, render_dataset
+    from synthgen.run.test_set import default_count
 
     if save is not None and only is None:
         raise click.UsageError("--save writes the sample of --only: add --only")
@@ -98,19 +109,34 @@ def render(
         certificates=certificates,
         dashboard=dashboard,
         shard_timeout_s=shard_timeout,
+        test_images=default_count(n, out, scheduler) if test_images is None else test_images,
     )
     if only is not None:
         _reproduce(job, only, save)
         return
     with resumable(out), progress_bar(quiet) as bar:
+        images = bar.add_task("test images", total=job.test_images, visible=False)
         task = bar.add_task("pairs", visible=False)
 
         def on_plan(plan: "RenderPlan") -> None:
             click.echo(plan.text, err=True)
-            bar.reset(task, total=plan.total, completed=plan.present, visible=True)
+            bar.reset(images, visible=plan.test_images > 0)
+            bar.reset(task, total=plan.total, completed=plan.present, visible=not plan.test_images)
 
-        summary = render_dataset(job, on_plan=on_plan, on_shard=lambda encoded: bar.advance(task, encoded.line["n"]))
+        def on_image(count: int) -> None:
+            bar.advance(images, count)
+            if bar.tasks[images].finished:  # the pairs' time begins
+                bar.reset(task, completed=int(bar.tasks[task].completed), visible=True)
+
+        summary = render_dataset(
+            job,
+            on_objects=echo_lines,
+            on_plan=on_plan,
+            on_image=on_image,
+            on_shard=lambda encoded: bar.advance(task, encoded.line["n"]),
+        )
     click.echo(summary.text, err=True)
+    click.echo(f"next: refinenet train {shlex.quote(out)}", err=True)
 
 
 def _reproduce(job: "RenderJob", index: int, save: Path | None) -> None:

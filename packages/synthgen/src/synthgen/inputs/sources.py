@@ -21,6 +21,7 @@ MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb", ".stl", ".off")
 MODELS_INFO = "models_info.json"
 LARGEST_OBJECT_ID = 2**31 - 1
 """Of the shards' field `obj_id`."""
+MOST_DIAMETER_LINES = 30
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +70,22 @@ class Sources:
             raise MeshError(f"--object: none of {len(files)} meshes can be loaded; the first: {bad[0]}")
         return loaded
 
+    def diameter_lines(self, meshes: Mapping[int, Mesh]) -> list[str]:
+        """A line with the diameter for each object, or a single line for many: a wrong unit is seen at once."""
+        if len(meshes) > MOST_DIAMETER_LINES:
+            sizes = sorted(mesh.diameter_m for mesh in meshes.values())
+            return [f"{len(meshes)} objects: diameters {1e3 * sizes[0]:.1f} to {1e3 * sizes[-1]:.1f} mm"]
+        unit_of = {
+            str(file): "BOP models are in mm"
+            if path.is_dir() and (path / MODELS_INFO).is_file()
+            else f"--units {units}"
+            for path in self.objects
+            for file, units in find_meshes(path, self.units, "--object")
+        }
+        return [
+            f"{diameter_text(Path(mesh.path).name, mesh.diameter_m)} ({unit_of[mesh.path]})" for mesh in meshes.values()
+        ]
+
     def assets(self) -> Assets:
         """Photographs, panoramas and occluder meshes, each decoded once.
 
@@ -105,6 +122,11 @@ class Sources:
             elif not path.is_dir():
                 infos |= {i: info for i in inside if (info := info_beside(path)) is not None}
         return infos
+
+
+def diameter_text(name: str, diameter_m: float) -> str:
+    """An object's file name with its diameter."""
+    return f"{name}: diameter {1e3 * diameter_m:.1f} mm"
 
 
 def object_ids(paths: Sequence[str]) -> list[int]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from posecore import config as config_tools
 from posecore.shard import ShardReader, n_shards
+from posecore.shard.layout import TEST_SET
 
 from synthgen.bop.card import CARD as BOP_CARD
 from synthgen.bop.card import read_card
@@ -17,6 +18,11 @@ _ASSETS = {"backgrounds": "photos", "hdris": "files", "occluders": "meshes"}  # 
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy")
 
 
+def is_bop_dataset(url: str) -> bool:
+    """Whether a path is a dataset of `synthgen bop`."""
+    return "://" not in url and (Path(url) / BOP_CARD).is_file()
+
+
 def dataset_info(url: str) -> dict[str, Any]:
     """Data card of a shard dataset, or of a BOP dataset of `synthgen bop`, with the extent of the committed data.
 
@@ -24,7 +30,7 @@ def dataset_info(url: str) -> dict[str, Any]:
         ShardError: Not a dataset, or a broken one.
         DatasetError: A BOP dataset whose card is broken.
     """
-    if "://" not in url and (Path(url) / BOP_CARD).is_file():
+    if is_bop_dataset(url):
         return _bop_info(Path(url))
     reader = ShardReader(url)
     reader.require("objects", "camera", "units")
@@ -34,6 +40,7 @@ def dataset_info(url: str) -> dict[str, Any]:
     for line in lines.values():
         for field, size in line["bytes"].items():
             sizes[field] = sizes.get(field, 0) + int(size)
+    test_set = f"{url}/{TEST_SET}"
     card_keys = (
         "n", "shard_size", "patch_px", "contour_points", "depth_step_m", "seed", "merged", "source", "objects",
         "camera", "units",
@@ -46,6 +53,7 @@ def dataset_info(url: str) -> dict[str, Any]:
         "complete": reader.complete,
         "pairs": {"committed": pairs, "total": reader.n},
         "shards": {"committed": len(reader.committed), "total": n_shards(card)},
+        "test_images": _bop_info(Path(test_set))["frames"] if is_bop_dataset(test_set) else 0,
         "bytes": sum(sizes.values()),
         "bytes_per_pair": {name: size / max(1, pairs) for name, size in sorted(sizes.items(), key=_by_size)},
         "quarantined_scenes": sorted(int(i) for line in lines.values() for i in line.get("quarantined", ())),
@@ -111,6 +119,7 @@ def _pair_lines(info: Mapping[str, Any]) -> list[str]:
     lines = [
         _entry("pairs", f"{pairs['committed']} of {pairs['total']}, {state}"),
         _entry("shards", f"{shards['committed']} of {shards['total']}, {card['shard_size']} pairs each"),
+        _entry("test images", f"{info['test_images']} in {TEST_SET}" if info["test_images"] else "none"),
         _entry("size", f"{info['bytes'] / 1e9:.3g} GB, {each / 1e3:.4g} kB a pair"),
     ]
     lines += [f"    {name}: {size / 1e3:.4g} kB" for name, size in info["bytes_per_pair"].items() if size >= 50]

@@ -1,6 +1,8 @@
 """Contact sheets: samples of a dataset with their labels overlaid."""
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,8 @@ from posecore.contour import contour_mask
 from posecore.errors import ConfigError, ShardError
 from posecore.files import write_atomic
 from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
+
+from synthgen.inputs.sources import diameter_text
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -29,35 +33,69 @@ _TITLES = (
 _GREEN, _RED = (60, 255, 60), (255, 60, 60)
 
 
-def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
+def contact_sheet(url: str, count: int, *, first: int | None = None) -> Image:
     """Draw samples of a dataset, one row each.
 
     Args:
         url: Shard dataset, complete or growing.
         count: Rows at most.
-        first: Index of the first sample.
+        first: Index of the first of consecutive samples; None spreads the samples over the scenes.
 
     Raises:
         ShardError: Nothing to show.
     """
     reader = ShardReader(url)
+    rendered = [i for shard in reader.committed for i in _indices_of(reader, shard)]
+    indices = _spread(reader, count) if first is None else [i for i in rendered if first <= i < first + count]
+    if not indices:
+        raise ShardError(
+            f"{url}: no rendered sample from {first or 0} on; {len(rendered)} of {reader.n} samples are rendered"
+        )
     rows = []
-    for shard_id in reader.committed:
-        start = shard_id * reader.shard_size
-        stop = start + reader.n_samples(shard_id)
-        indices = range(max(first, start), min(stop, first + count))
-        if not indices:
-            continue
+    for shard_id, shown in groupby(indices, key=lambda i: i // reader.shard_size):
         samples = reader.read_checked(shard_id)
-        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in indices]
-    if not rows:
-        rendered = sum(map(reader.n_samples, reader.committed))
-        raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
+        start = shard_id * reader.shard_size
+        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in shown]
     return np.concatenate([title_row(), *rows])
 
 
-def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> tuple[int, int]:
+def _indices_of(reader: ShardReader, shard_id: int) -> range:
+    start = shard_id * reader.shard_size
+    return range(start, start + reader.n_samples(shard_id))
+
+
+def _spread(reader: ShardReader, count: int) -> list[int]:
+    """Samples of as many scenes as possible, evenly over the dataset; a scene's further ones where scenes are few."""
+    ranked: dict[int, list[int]] = {}  # samples by their number within the scene
+    seen: Counter[int] = Counter()
+    for shard_id in reader.committed:
+        scenes = reader.read(shard_id, ["scene_index"])["scene_index"].tolist()
+        for index, scene in zip(_indices_of(reader, shard_id), scenes, strict=True):
+            ranked.setdefault(seen[scene], []).append(index)
+            seen[scene] += 1
+    chosen: list[int] = []
+    for _, indices in sorted(ranked.items()):
+        missing = min(count - len(chosen), len(indices))
+        chosen += [indices[i * len(indices) // missing] for i in range(missing)]
+    return sorted(chosen)
+
+
+def save_contact_sheet(
+    url: str,
+    file: Path,
+    count: int,
+    *,
+    first: int | None = None,
+    on_objects: Callable[[Sequence[str]], None] = lambda lines: None,
+) -> tuple[int, int]:
     """Write a contact sheet as a picture; see `contact_sheet`.
+
+    Args:
+        url: Shard dataset.
+        file: Picture.
+        count: Rows at most.
+        first: Index of the first of consecutive samples.
+        on_objects: Called once with a line for each object, its diameter.
 
     Returns:
         Width and height, pixels.
@@ -69,6 +107,8 @@ def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> t
     """
     if file.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise ConfigError(f"--out {file}: expected a .png or .jpg file")
+    objects = ShardReader(url).card["objects"].values()
+    on_objects([diameter_text(card["name"], card["diameter_m"]) for card in objects])
     sheet = contact_sheet(url, count, first=first)
     ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
     assert ok

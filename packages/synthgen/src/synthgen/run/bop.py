@@ -1,6 +1,6 @@
 """From a job to a BOP dataset of whole images: the application behind `synthgen bop`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from synthgen.bop.dataset_writer import write_dataset
@@ -47,18 +47,23 @@ class BopSummary:
 
 
 def render_bop_dataset(
-    job: BopJob, *, on_frame: Callable[[int, int], None] = lambda scene_id, im_id: None
+    job: BopJob,
+    *,
+    on_objects: Callable[[Sequence[str]], None] = lambda lines: None,
+    on_frame: Callable[[int, int], None] = lambda scene_id, im_id: None,
 ) -> BopSummary:
     """Render a BOP dataset, or the missing images of an unfinished one.
 
     Args:
         job: The dataset.
+        on_objects: Called once with the objects' diameters, see `Sources.diameter_lines`.
         on_frame: Called with scene and image id of every image that is on disk, earlier ones included.
 
     Raises:
         PoseError: An input cannot be loaded; or see `dataset_writer.write_dataset`.
     """
     meshes, assets = job.sources.meshes(), job.sources.assets()
+    on_objects(job.sources.diameter_lines(meshes))
     infos = job.sources.infos(meshes)
     write_dataset(
         job.out, job.config, meshes, job.plan, assets=assets, infos=infos, workers=job.workers, on_frame=on_frame

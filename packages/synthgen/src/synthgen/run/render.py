@@ -1,14 +1,14 @@
 """From a job to a dataset of rendered pairs: the application behind `synthgen render`."""
 
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from posecore.errors import ConfigError, PoseError, RenderError
 from posecore.shard import Encoded
-from posecore.shard.layout import MANIFEST
+from posecore.shard.layout import MANIFEST, TEST_SET
 
 from synthgen import lock
 from synthgen.config import SynthConfig
@@ -16,7 +16,7 @@ from synthgen.engines.devices import choose_device, list_gpus, visible_gpus
 from synthgen.inputs.sources import Sources
 from synthgen.machine import cores, require_free_space, size_text
 from synthgen.pairs import data_card
-from synthgen.run import dispatcher
+from synthgen.run import dispatcher, test_set
 from synthgen.run.cluster import Certificates
 from synthgen.run.estimate import estimate
 from synthgen.run.shard_job import ShardJob
@@ -40,6 +40,7 @@ class RenderJob:
         shard_timeout_s: See `dispatcher.run`.
         certificates: For a scheduler with TLS.
         dashboard: Port of dask's web page of local processes, on this machine only; None for none.
+        test_images: Number of images of other scenes, in BOP layout, in the folder `test_bop` of the dataset.
     """
 
     out: str
@@ -51,8 +52,10 @@ class RenderJob:
     shard_timeout_s: float | None = None
     certificates: Certificates | None = None
     dashboard: int | None = None
+    test_images: int = 0
 
     def __post_init__(self) -> None:
+        test_set.require_local(self.out, self.test_images)
         if self.workers and self.scheduler:
             raise ConfigError(
                 "--workers starts local processes, --scheduler uses the workers of a cluster: give only one option"
@@ -76,6 +79,7 @@ class RenderPlan:
         present: Pairs that are committed and sound.
         damaged: Defects of committed shards, by shard; these shards are rendered again.
         forecast: Size and time of the missing pairs, in words.
+        test_images: Number of test images, rendered before the pairs.
     """
 
     url: str
@@ -84,6 +88,7 @@ class RenderPlan:
     present: int
     damaged: Mapping[int, str]
     forecast: str
+    test_images: int = 0
 
     @property
     def text(self) -> str:
@@ -98,6 +103,8 @@ class RenderPlan:
             f"{self.url}: {self.present} of {self.total} pairs are there, rendering {self.total - self.present} with "
             f"{self.engine}, {self.forecast}"
         )
+        if self.test_images:
+            lines.append(f"{self.url}/{TEST_SET}: {self.test_images} test images of other scenes come first")
         return "\n".join(lines)
 
 
@@ -109,31 +116,38 @@ class RenderSummary:
         url: Dataset.
         pairs: Number of pairs.
         quarantined: Scenes that crashed the renderer and were drawn anew.
+        test_images: Number of test images beside them.
     """
 
     url: str
     pairs: int
     quarantined: tuple[int, ...]
+    test_images: int = 0
 
     @property
     def text(self) -> str:
         """The summary in one line."""
         scenes = self.quarantined
         replaced = f", {len(scenes)} scenes quarantined and drawn anew" if scenes else ""
-        return f"{self.url}: complete, {self.pairs} pairs{replaced}"
+        images = f", {self.test_images} test images" if self.test_images else ""
+        return f"{self.url}: complete, {self.pairs} pairs{images}{replaced}"
 
 
 def render_dataset(
     job: RenderJob,
     *,
+    on_objects: Callable[[Sequence[str]], None] = lambda lines: None,
     on_plan: Callable[[RenderPlan], None] = lambda plan: None,
+    on_image: Callable[[int], None] = lambda count: None,
     on_shard: Callable[[Encoded], None] = lambda encoded: None,
 ) -> RenderSummary:
-    """Render a dataset, or the missing shards of an unfinished one.
+    """Render a dataset, or the missing shards and test images of an unfinished one.
 
     Args:
         job: The dataset.
-        on_plan: Called once before the first shard is rendered.
+        on_objects: Called once with the objects' diameters, see `Sources.diameter_lines`.
+        on_plan: Called once before the first image is rendered.
+        on_image: Called with 1 for every test image on disk.
         on_shard: Called after each commit; the manifest line holds the number of pairs.
 
     Raises:
@@ -144,6 +158,7 @@ def render_dataset(
         RenderError: An engine or device is missing, or workers keep dying.
     """
     shards, gpus = _loaded(job)
+    on_objects(job.sources.diameter_lines(shards.meshes))
     workers = job.workers or len(gpus) or min(MOST_WORKERS, cores())
     new = "://" not in job.out and not Path(job.out).exists()
     with lock.held(job.out), _removed_if_useless(Path(job.out) if new else None):
@@ -155,15 +170,13 @@ def render_dataset(
         damaged = writer.damaged()
         present, total = dispatcher.progress(shards, writer, damaged)
         forecast = _forecast(job.out, shards, total - present, None if job.scheduler else workers)
-        on_plan(
-            RenderPlan(
-                url=job.out,
-                engine=shards.config.engine,
-                total=total,
-                present=present,
-                damaged=damaged,
-                forecast=forecast,
-            )
+        plan = RenderPlan(
+            url=job.out, engine=shards.config.engine, total=total, present=present, damaged=damaged, forecast=forecast,
+            test_images=job.test_images,
+        )  # fmt: skip
+        on_plan(plan)
+        test_set.render_test_set(
+            job.out, job.test_images, shards, job.sources, workers=1 if gpus else workers, on_image=on_image
         )
         dispatcher.run(
             shards,
@@ -177,7 +190,9 @@ def render_dataset(
             certificates=job.certificates,
             dashboard=job.dashboard,
         )
-        return RenderSummary(url=job.out, pairs=total, quarantined=tuple(writer.quarantined()))
+        return RenderSummary(
+            url=job.out, pairs=total, quarantined=tuple(writer.quarantined()), test_images=job.test_images
+        )
 
 
 def shard_job(job: RenderJob) -> ShardJob:

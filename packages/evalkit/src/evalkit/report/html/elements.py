@@ -45,7 +45,7 @@ def case(title: str, pictures: Sequence[Picture]) -> str:
 
 def cases(articles: Sequence[str], pictures_each: int) -> str:
     """A grid of cases, each wide enough for its pictures."""
-    width = 20 + 190 * max(1, min(pictures_each, 4))
+    width = 20 + 158 * max(1, min(pictures_each, 4))
     return f'<div class="cases" style="--case: {width}px">{"".join(articles)}</div>'
 
 

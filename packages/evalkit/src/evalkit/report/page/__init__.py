@@ -1,4 +1,4 @@
-"""A report's page from scores and pictures: summary, tables, plots, worst cases, definitions, inputs."""
+"""A report's page from scores and pictures: cases and curves, words, tables, definitions, inputs."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from evalkit.evaluation.scored_file import Scored
 from evalkit.report import html, svg_plots
 from evalkit.report.html import Section
 from evalkit.report.page import about, bins, cases, convergence, failures, recall_curves, summary_text
-from evalkit.tables.report_tables import comparison_tables, object_tables, total_tables
+from evalkit.tables.report_tables import comparison_tables, curve_tables, object_tables, total_tables
 
 UNFOLDED_FILES = 1
 """With more files than this, the many tables by object are folded below the comparison."""
@@ -21,19 +21,21 @@ def report_page(evaluator: Evaluator, scored: Sequence[Scored], summary: Mapping
         evaluator: of the files; it renders the contours.
         scored: result files in the summary's order.
         summary: of `evalkit.report.summary.summarise`.
-        worst: number of worst cases shown as pictures.
+        worst: number of worst cases shown as pictures; 0 shows no case.
     """
     styles = svg_plots.line_styles([item.file.is_initial for item in scored])
     key = svg_plots.legend([item.file.name for item in scored], styles)
     sections = [
+        Section(heading="Typical and worst cases", parts=cases.first(evaluator, scored, worst)),
+        Section(heading="Recall curves", parts=[key, recall_curves.figures(scored, styles)]),
+        Section(heading="From perturbed initial poses", parts=_keyed(key, convergence.plots(summary, styles))),
         Section(heading="Summary", parts=summary_text.summary(summary)),
         Section(heading="Totals", parts=[*map(html.table, total_tables(summary)), *_ignored(summary)]),
         Section(heading="By object", parts=_objects(summary)),
-        Section(heading="Recall curves", parts=[key, recall_curves.figures(scored, styles)]),
+        Section(heading="By level of perturbation", parts=[*map(html.table, curve_tables(summary))]),
         Section(heading="By visibility, distance and viewpoint", parts=_keyed(key, bins.parts(summary, styles))),
         Section(heading="Failures", parts=failures.parts(summary)),
-        Section(heading="From perturbed initial poses", parts=_keyed(key, convergence.parts(summary, styles))),
-        Section(heading="Worst cases", parts=cases.worst(evaluator, scored, worst)),
+        Section(heading="Further worst cases", parts=cases.further_worst(evaluator, scored, worst)),
         Section(heading="Missing estimates", parts=cases.missing(scored)),
         Section(heading="Definitions", parts=[html.definitions(summary["definitions"])]),
         Section(heading="Conventions", parts=[html.definitions(about.CONVENTIONS)]),

@@ -9,16 +9,48 @@ from evalkit.evaluation.evaluator import Evaluator
 from evalkit.evaluation.scored_file import CaseKey, Scored
 from evalkit.report import html, pictures
 from evalkit.report.html import Picture
-from evalkit.report.summary import worst_cases
+from evalkit.report.summary import ranked_cases
 
 MISSING_LISTED = 20
+SHOWN_FIRST = 3
+"""Typical and worst cases at the page's top."""
 PICTURES_BYTES = 20_000_000
-"""Limit for a page's pictures, so that the page opens quickly."""
+"""Limit for the pictures of a list of cases, so that the page opens quickly."""
 
 
-def worst(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[str]:
-    """The poses with the lowest VSS in the last result file, and the same poses in the other files."""
-    keys = worst_cases(scored, count)
+def first(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[str]:
+    """Typical cases, whose VSS in the last result file is next to its median, and the worst ones; each in every file.
+
+    Args:
+        evaluator: of the files.
+        scored: result files.
+        count: worst cases shown on the whole page; 0 shows no case.
+    """
+    if not count or not scored:
+        return []
+    ranked = ranked_cases(scored)
+    worst = ranked[: min(count, SHOWN_FIRST)]
+    others = ranked[len(worst) :]
+    begin = min(max(len(ranked) // 2 - SHOWN_FIRST // 2 - len(worst), 0), max(len(others) - SHOWN_FIRST, 0))
+    typical = others[begin : begin + SHOWN_FIRST]
+    name = scored[-1].file.name
+    shown = [
+        *_shown(evaluator, scored, typical, f"Typical: VSS next to the median of {name}"),
+        *_shown(evaluator, scored, worst, f"Worst: lowest VSS in {name}"),
+    ]
+    if not shown:
+        return [html.paragraph("No pictures: the dataset has no images of these poses.", soft=True)] if ranked else []
+    return [legend(), *shown]
+
+
+def further_worst(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[str]:
+    """The worst cases that follow those of `first`, up to `count` in total."""
+    keys = ranked_cases(scored)[SHOWN_FIRST:count]
+    return [legend(), *shown] if (shown := _shown(evaluator, scored, keys, "")) else []
+
+
+def _shown(evaluator: Evaluator, scored: Sequence[Scored], keys: Sequence[CaseKey], title: str) -> list[str]:
+    """Cases with images, in a grid; empty without any."""
     lookups = [item.cases() for item in scored]
     articles: list[str] = []
     size = 0
@@ -29,11 +61,11 @@ def worst(evaluator: Evaluator, scored: Sequence[Scored], count: int) -> list[st
             break
         articles += [article] if article else []
     if not articles:
-        return [html.paragraph("No pictures: the dataset has no images of these poses.", soft=True)] if keys else []
-    shown = f"{len(articles)} poses with the lowest VSS" if len(articles) > 1 else "The pose with the lowest VSS"
-    short = "" if len(articles) == len(keys) else f" {len(keys) - len(articles)} more have no image or no room here."
-    note = f"{shown} in {scored[-1].file.name}, lowest first.{short}"
-    return [html.paragraph(note), legend(), html.cases(articles, len(scored))]
+        return []
+    left = len(keys) - len(articles)
+    note = [html.paragraph(f"{left} more have no image or no room here.", soft=True)] if left else []
+    heading = [html.heading(title)] if title else []
+    return [*heading, *note, html.cases(articles, len(scored))]
 
 
 def legend() -> str:

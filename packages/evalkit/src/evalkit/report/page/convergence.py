@@ -1,4 +1,4 @@
-"""Convergence from initial poses perturbed by steps: curves and tables."""
+"""Curves of convergence from initial poses perturbed by steps."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from evalkit.report import html, svg_plots
+from evalkit.report import svg_plots
 from evalkit.report.svg_plots import LineStyle, Series
-from evalkit.tables.report_tables import curve_tables
 
 LEVEL_PLOTS = (
     ("Rotation error under 5°", "under_5deg", True),
@@ -22,12 +21,8 @@ LEVEL_PLOTS = (
 LEVEL_LABELS = {"angle": "initial pose rotated by, degrees", "translation": "initial pose translated by, diameters"}
 
 
-def parts(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
-    """Plots and tables; nothing without initial poses perturbed by steps."""
-    return [*_plots(summary, styles), *map(html.table, curve_tables(summary))]
-
-
-def _plots(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
+def plots(summary: Mapping[str, Any], styles: Sequence[LineStyle]) -> list[str]:
+    """The curves; nothing without initial poses perturbed by steps."""
     shown = []
     for kind, label in LEVEL_LABELS.items():
         drawn = [
