@@ -1,12 +1,75 @@
-"""Whole-file writes, hashes and the data files that ship with the project."""
+"""Opening of regular files, whole-file writes, hashes and the data files that ship with the project."""
 
 import contextlib
 import errno
 import hashlib
 import os
+import stat
 from pathlib import Path
+from typing import BinaryIO
 
 from posecore.errors import ConfigError, StorageError
+
+LARGEST_FILE_BYTES = 1 << 31
+"""Default limit of a file that is read whole: 2 GiB."""
+_KINDS = (
+    (stat.S_ISDIR, "is a folder"),
+    (stat.S_ISFIFO, "is a pipe"),
+    (stat.S_ISSOCK, "is a socket"),
+    (stat.S_ISCHR, "is a device"),
+    (stat.S_ISBLK, "is a device"),
+)
+
+
+def open_regular(path: str | Path, limit_bytes: int | None = LARGEST_FILE_BYTES) -> BinaryIO:
+    """Open a user's file for reading. A pipe would block for ever, and a device may have no end.
+
+    Args:
+        path: The file, or a link to it.
+        limit_bytes: Largest file that is opened; None for files of which only parts are read.
+
+    Raises:
+        OSError: Missing, no rights, not a regular file, larger than the limit, or a name that no file can have. Its
+            `strerror` is the reason in words, for the caller's message.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except ValueError as error:  # a zero byte, or characters that no encoding of a name has
+        raise OSError(errno.EINVAL, "is a name that no file can have", str(path)) from error
+    try:
+        _require_regular(os.fstat(descriptor), path, limit_bytes)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return os.fdopen(descriptor, "rb")
+
+
+def read_regular(path: str | Path, limit_bytes: int = LARGEST_FILE_BYTES) -> bytes:
+    """The bytes of a user's file.
+
+    Raises:
+        OSError: As `open_regular`.
+    """
+    with open_regular(path, limit_bytes) as stream:
+        return stream.read()
+
+
+def require_regular(path: str | Path, limit_bytes: int | None = LARGEST_FILE_BYTES) -> None:
+    """Refuse a user's file, as `open_regular` does, before a library opens it by its name.
+
+    Raises:
+        OSError: As `open_regular`.
+    """
+    open_regular(path, limit_bytes).close()
+
+
+def _require_regular(status: os.stat_result, path: str | Path, limit_bytes: int | None) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = next((text for is_kind, text in _KINDS if is_kind(status.st_mode)), "is of another kind")
+        code = errno.EISDIR if stat.S_ISDIR(status.st_mode) else errno.EINVAL
+        raise OSError(code, f"{kind}, expected a regular file", str(path))
+    if limit_bytes is not None and status.st_size > limit_bytes:
+        raise OSError(errno.EFBIG, f"has {status.st_size} bytes, expected at most {limit_bytes}", str(path))
 
 
 def write_atomic(path: str | Path, data: bytes) -> None:
@@ -90,7 +153,7 @@ def sha256_bytes(data: bytes) -> str:
 def sha256_file(path: str | Path) -> str:
     """Hexadecimal SHA-256 of a file's bytes."""
     digest = hashlib.sha256()
-    with Path(path).open("rb") as stream:
+    with open_regular(path, None) as stream:
         while block := stream.read(1 << 20):
             digest.update(block)
     return digest.hexdigest()
