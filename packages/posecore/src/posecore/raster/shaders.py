@@ -27,6 +27,7 @@ FRAGMENT_SHADER = """
 #version 330
 uniform sampler2D image;
 uniform bool textured;
+uniform bool coloured;
 uniform vec3 tint;
 uniform float ambient;
 uniform float diffuse;
@@ -48,6 +49,7 @@ void main() {
     if (n_lights == 0) light += diffuse * dot(n, to_eye);
     for (int i = 0; i < n_lights; ++i) light += diffuse * light_rgb[i] * max(dot(n, light_direction[i]), 0.0);
     vec3 own = textured ? texture(image, texcoord).rgb : base;
+    if (textured && coloured) own *= base;
     rgb = vec4(min(own * tint * light, 1.0), 1.0);
     depth_instance = vec2(p_cam.z, instance);
 }
