@@ -19,6 +19,7 @@ from posecore.errors import MeshError
 from posecore.files import write_atomic
 from posecore.mesh_files import GREY, METRE_SUFFIXES, TIMES_COLOURS, mesh_bytes, read_surface
 from posecore.mesh_files.creases import split_creases
+from posecore.mesh_files.part import display_from_linear, linear_from_display, to_bytes
 
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -27,7 +28,7 @@ DIAMETER_RANGE_M = (2e-3, 10.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """A triangle mesh in object coordinates. With a texture and vertex colours its colour is their product.
+    """A triangle mesh in object coordinates. Texture and vertex colours together count as a product in linear light.
 
     Attributes:
         vertices_m: (v, 3) metres.
@@ -73,7 +74,10 @@ class Mesh:
             column = np.floor((self.uv[:, 0] % 1.0) * w).astype(int).clip(0, w - 1)
             row = np.floor((1.0 - self.uv[:, 1] % 1.0) * h).astype(int).clip(0, h - 1)
             sampled = np.asarray(self.texture_rgb[row, column])
-            return sampled if self.vertex_rgb is None else np.rint(sampled * (self.vertex_rgb / 255.0)).astype(np.uint8)
+            if self.vertex_rgb is None:
+                return sampled
+            light = linear_from_display(sampled / 255.0) * linear_from_display(self.vertex_rgb / 255.0)
+            return to_bytes(display_from_linear(light))
         if self.vertex_rgb is not None:
             return self.vertex_rgb
         return np.full((len(self.vertices_m), 3), GREY, np.uint8)

@@ -15,8 +15,8 @@ from trimesh.exchange.obj import load_obj
 from posecore.errors import MeshError, TextureError
 from posecore.mesh_files.images import DecodedImage, beside, decode, linked_bytes, missing
 from posecore.mesh_files.mtl import HOLE, NEARLY_OPAQUE, MaterialMap, MtlMaterial, read_materials
-from posecore.mesh_files.part import MeshPart, Texture, decoded, to_bytes
-from posecore.mesh_files.polygons import concave, ears
+from posecore.mesh_files.part import MeshPart, Texture, decoded, to_bytes, two_looks
+from posecore.mesh_files.polygons import concave, ears, fingerprints, repeated
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ def read_obj(file: Path, data: bytes, *, allow_missing_textures: bool = False) -
     libraries = re.findall(r"^mtllib +(.+)$", text, re.MULTILINE | re.IGNORECASE)
     materials = _materials(file, list(dict.fromkeys(libraries)), names, allow_missing_textures)
     text = re.sub(r"^mtllib .*$", "", text, flags=re.MULTILINE | re.IGNORECASE)
-    text = "mtllib m.mtl\n" + _without_concave(_absolute(file, text))
+    text = "mtllib m.mtl\n" + _plain_polygons(file, _absolute(file, text))
     library = "".join(f"newmtl m{i}\nKd 1 1 1\n" for i in range(len(names)))
     geometry = load_obj(io.BytesIO(text.encode()), resolver={"m.mtl": library.encode()}).get("geometry", {})
     parts = []
@@ -264,8 +264,8 @@ def _absolute(file: Path, text: str) -> str:
     return "\n".join(lines)
 
 
-def _without_concave(text: str) -> str:
-    """The text with triangles in place of concave polygons, which trimesh would draw as fans."""
+def _plain_polygons(file: Path, text: str) -> str:
+    """The text with triangles in place of concave polygons, which trimesh would draw as fans, and no polygon twice."""
     lines = [match for match in re.finditer(r"^f [^\n]+", text, re.MULTILINE) if match[0].count(" ") > 3]
     polygons = [match[0].split()[1:] for match in lines]
     kept = [i for i, corners in enumerate(polygons) if len(corners) > 3]
@@ -274,15 +274,23 @@ def _without_concave(text: str) -> str:
     numbers = re.findall(r"^v +(\S+) +(\S+) +(\S+)", text, re.MULTILINE)
     vertices = np.array(numbers, np.float64)
     sizes = np.array([len(polygons[i]) for i in kept])
-    corners = np.array([int(corner.split("/", 1)[0]) for i in kept for corner in polygons[i]]) - 1
-    if corners.min() < 0 or corners.max() >= len(vertices):
+    rows = np.array([int(corner.split("/", 1)[0]) for i in kept for corner in polygons[i]]) - 1
+    if rows.min() < 0 or rows.max() >= len(vertices):
         return text  # refused later, with the face
-    starts = np.concatenate([[0], np.cumsum(sizes)])
+    corners, starts = vertices[rows], np.concatenate([[0], np.cumsum(sizes)])
+    changes = {}
+    for j in np.flatnonzero(concave(corners, sizes)):
+        words = polygons[kept[j]]
+        triangles = ears(corners[starts[j] : starts[j + 1]])
+        changes[j] = "\n".join("f " + " ".join(words[k] for k in triangle) for triangle in triangles)
+    for copy, original in repeated(fingerprints(corners, sizes)):
+        materials = {text.rfind("\nusemtl ", 0, lines[kept[j]].start()) for j in (copy, original)}
+        if len({text[at : text.find("\n", at + 1)] if at >= 0 else "" for at in materials}) > 1:
+            raise MeshError(two_looks(file))
+        changes[copy] = ""
     pieces, position = [], 0
-    for j in np.flatnonzero(concave(vertices[corners], sizes)):
-        match, words = lines[kept[j]], polygons[kept[j]]
-        triangles = ears(vertices[corners[starts[j] : starts[j + 1]]])
-        pieces.append(text[position : match.start()])
-        pieces.append("\n".join("f " + " ".join(words[k] for k in triangle) for triangle in triangles))
+    for j in sorted(changes):
+        match = lines[kept[j]]
+        pieces += [text[position : match.start()], changes[j]]
         position = match.end()
     return "".join(pieces) + text[position:]

@@ -1,6 +1,7 @@
 """A part of a mesh file: triangles that share a look, before parts are joined to a mesh."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -61,6 +62,11 @@ def display_from_linear(values: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*
 def to_bytes(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
     """8-bit values of values in [0, 1]."""
     return np.asarray(np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8))
+
+
+def two_looks(file: Path) -> str:
+    """Why faces that lie on each other with different colours are refused."""
+    return f"{file}: two faces lie on each other and have different colours, of which chance would show one; move one"
 
 
 def decoded(data: bytes) -> str:

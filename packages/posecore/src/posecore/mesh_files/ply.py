@@ -206,8 +206,8 @@ def _row(data: bytes, position: int, properties: list[list[str]], order: str) ->
 
 
 def _triangles(
-    faces: Int[np.ndarray, "f 3"], table: Any, vertices: Float[np.ndarray, "v 3"]
-) -> tuple[Int[np.ndarray, "f 3"], Int[np.ndarray, " f"]]:
+    faces: Int[np.ndarray, "f n"], table: Any, vertices: Float[np.ndarray, "v 3"]
+) -> tuple[Int[np.ndarray, "t 3"], Int[np.ndarray, " t"]]:
     """Triangles, and the row of each in the file."""
     polygons = _lists(table, ("vertex_indices", "vertex_index"))
     if polygons is None or (isinstance(polygons, np.ndarray) and polygons.ndim == 2 and polygons.shape[1] == 3):

@@ -30,7 +30,9 @@ def read_stl(file: Path, data: bytes) -> list[MeshPart]:
     for entry in loaded["geometry"].values() if "geometry" in loaded else [loaded]:
         mesh = trimesh.Trimesh(**entry, process=False)
         attributes = entry.get("face_attributes", {}).get("stl")
-        colours = None if attributes is None else _colours(data[:80], np.asarray(attributes).reshape(-1))
+        colours = (
+            None if attributes is None else _colours(data[:80], np.asarray(attributes).reshape(-1).astype(np.int64))
+        )
         parts.append(
             MeshPart(
                 vertices=np.asarray(mesh.vertices, np.float64),
@@ -64,7 +66,7 @@ def _refuse_cut(file: Path, data: bytes) -> None:
 
 def _colours(header: bytes, attributes: Int[np.ndarray, " f"]) -> UInt8[np.ndarray, "f 3"] | None:
     """Display colours of the facets; None where no facet has one."""
-    bits = attributes.astype(np.int64)
+    bits = attributes
     marked = (bits & 0x8000) != 0
     low, middle, high = (to_bytes(((bits >> shift) & 31) / 31.0) for shift in (0, 5, 10))
     start = header.find(b"COLOR=")

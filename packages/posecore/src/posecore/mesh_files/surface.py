@@ -5,11 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from posecore.errors import MeshError
 from posecore.mesh_files.atlas import needs_atlas, with_atlas
-from posecore.mesh_files.part import GREY, MeshPart
+from posecore.mesh_files.part import GREY, MeshPart, two_looks
+from posecore.mesh_files.polygons import fingerprints, repeated
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,29 +106,20 @@ def _without_duplicates(file: Path, parts: list[MeshPart]) -> list[MeshPart]:
     Raises:
         MeshError: Faces on each other look different: which is seen would be chance.
     """
-    corners = np.concatenate([part.vertices[part.faces] for part in parts])
-    candidates = _alike(corners)
-    if not candidates.any():
+    corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
+    copies = repeated(fingerprints(corners, np.full(len(corners) // 3, 3)))
+    if not len(copies):
         return parts
-    rows = np.flatnonzero(candidates)
-    points, point = np.unique(corners[rows].reshape(-1, 3) + 0.0, axis=0, return_inverse=True)
-    del points
-    keys = np.sort(point.reshape(-1, 3), axis=1)
-    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    first, inverse = rows[first], inverse.reshape(-1)
-    doubled = rows != first[inverse]
     part_of = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
     starts = np.cumsum([0, *(len(part.faces) for part in parts)])
-    for face, original in zip(rows[doubled], first[inverse][doubled], strict=True):
+    for face, original in copies.tolist():
         a, b = parts[part_of[face]], parts[part_of[original]]
         if a.texture is not b.texture or not _same_colours(
-            a, face - starts[part_of[face]], b, original - starts[part_of[original]]
+            a, face - int(starts[part_of[face]]), b, original - int(starts[part_of[original]])
         ):
-            raise MeshError(
-                f"{file}: two faces lie on each other and look different, which would be seen is chance; move one"
-            )
-    kept = np.ones(len(corners), bool)
-    kept[rows[doubled]] = False
+            raise MeshError(two_looks(file))
+    kept = np.ones(len(corners) // 3, bool)
+    kept[copies[:, 0]] = False
     remaining = [
         MeshPart(**{**part.__dict__, "faces": part.faces[kept[starts[i] : starts[i + 1]]]})
         for i, part in enumerate(parts)
@@ -140,22 +132,6 @@ def _same_colours(a: MeshPart, face: int, b: MeshPart, original: int) -> bool:
         return np.full(3, -1.0) if part.rgb is None else part.rgb[part.faces[row]].mean(axis=0)
 
     return bool(np.abs(mean(a, face) - mean(b, original)).max() < 2.0)
-
-
-def _alike(corners: Float[np.ndarray, "f 3 3"]) -> Bool[np.ndarray, " f"]:
-    """Faces that may have the same corners as another: a sum over the corners' bits, in any order, is the same."""
-    bits = np.ascontiguousarray(corners + 0.0).view(np.uint64)  # + 0.0 makes -0.0 a 0.0
-    factors = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
-    mixed = (bits * factors).sum(axis=2, dtype=np.uint64)
-    mixed ^= mixed >> np.uint64(29)
-    mixed *= np.uint64(0xBF58476D1CE4E5B9)
-    sums = mixed.sum(axis=1, dtype=np.uint64)
-    order = np.argsort(sums, kind="stable")
-    equal = sums[order][1:] == sums[order][:-1]
-    alike = np.zeros(len(sums), bool)
-    alike[order[1:][equal]] = True
-    alike[order[:-1][equal]] = True
-    return alike
 
 
 def _with_normals(part: MeshPart) -> MeshPart:
