@@ -188,7 +188,7 @@ def _faces(indices: Int[np.ndarray, " n"], mode: int) -> Int[np.ndarray, "f 3"]:
     if mode == _STRIP:
         strip = np.stack([indices[:-2], indices[1:-1], indices[2:]], axis=1)
         strip[1::2] = strip[1::2, [1, 0, 2]]  # every other triangle of a strip faces the other way
-        return strip
+        return np.asarray(strip)
     if mode == _FAN:
         n = max(len(indices) - 2, 0)
         return np.stack([np.repeat(indices[:1], n), indices[1 : n + 1], indices[2 : n + 2]], axis=1)
