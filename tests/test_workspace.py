@@ -21,6 +21,7 @@ DISTRIBUTIONS = {  # module -> the name it is installed under, where the two dif
     "cv2": "opencv-python-headless",
     "google_crc32c": "google-crc32c",
     "huggingface_hub": "huggingface-hub",
+    "mapbox_earcut": "mapbox-earcut",
     "mathutils": "bpy",
     "PIL": "pillow",
     "yaml": "pyyaml",
@@ -28,7 +29,6 @@ DISTRIBUTIONS = {  # module -> the name it is installed under, where the two dif
 WANTED_UNSEEN = {  # declared though no line imports them
     "bpy",  # imported inside synthgen/engines/blender only, some of it as mathutils
     "dask",  # distributed needs one of its own age
-    "pillow",  # trimesh reads textures with it
     "tensorboard",  # torch.utils.tensorboard writes with it
     "s3fs",  # fsspec opens s3:// with it
     "onnx",
@@ -40,8 +40,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
 TEST_TIME_ORACLES = {"timm"}
 ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
     "posecore": (
-        "errors text schema renamed se3 files image_file config processes numba_jit ply symmetry mesh simplify window "
-        "camera contour raster store shard bop html command_line"
+        "errors text schema renamed se3 files image_file config processes numba_jit ply mesh_files symmetry mesh simplify "
+        "window camera contour raster store shard bop html command_line"
     ),
     "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (

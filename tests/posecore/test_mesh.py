@@ -189,7 +189,11 @@ def test_a_bad_texture_is_passed_over_when_told_to(tmp_path: Path, texture: byte
 def test_a_missing_gltf_texture_is_an_error_not_grey(shared_data: Path, tmp_path: Path) -> None:
     bowl = shared_data / "meshes/evo_bowl"
     (tmp_path / "evo_bowl.bin").write_bytes((bowl / "evo_bowl.bin").read_bytes())
-    content = json.loads((bowl / "evo_bowl.gltf").read_text()) | {"images": [{"uri": "a%20skin.png"}]}
+    content = json.loads((bowl / "evo_bowl.gltf").read_text()) | {
+        "images": [{"uri": "a%20skin.png"}],
+        "textures": [{"source": 0}],
+    }
+    content["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     (tmp_path / "bowl.gltf").write_text(json.dumps(content))
     with pytest.raises(MeshError, match=r"texture .*a skin.png is missing"):
         load_mesh(tmp_path / "bowl.gltf", units="m")

@@ -1,13 +1,10 @@
 """Triangle meshes with vertex colours or a texture, in metres."""
 
 import hashlib
-import json
-import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
-from urllib.parse import unquote
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -18,11 +15,11 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import cdist
 
-from posecore.errors import MeshError, TextureError
+from posecore.errors import MeshError
 from posecore.files import write_atomic
-from posecore.ply import refuse_broken_ply
-
-logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
+from posecore.mesh_files import GREY, METRE_SUFFIXES, TIMES_COLOURS, mesh_bytes, read_surface
+from posecore.mesh_files.creases import split_creases
+from posecore.mesh_files.part import display_from_linear, linear_from_display, to_bytes
 
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -31,7 +28,7 @@ DIAMETER_RANGE_M = (2e-3, 10.0)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """A triangle mesh in object coordinates.
+    """A triangle mesh in object coordinates. Texture and vertex colours together count as a product in linear light.
 
     Attributes:
         vertices_m: (v, 3) metres.
@@ -40,6 +37,7 @@ class Mesh:
         vertex_rgb: (v, 3) display (sRGB) colours, or None.
         uv: (v, 2) texture coordinates, origin at the texture's bottom left, or None.
         texture_rgb: (h, w, 3) display colours, row 0 at the top, or None.
+        has_normals: Whether the normals are the file's. Others are smooth, and hard edges come with `drawn`.
         path: Source file.
         sha256: Hash of that file's bytes.
     """
@@ -50,6 +48,7 @@ class Mesh:
     vertex_rgb: UInt8[np.ndarray, "v 3"] | None = None
     uv: Float[np.ndarray, "v 2"] | None = None
     texture_rgb: UInt8[np.ndarray, "h w 3"] | None = None
+    has_normals: bool = True
     path: str = ""
     sha256: str = ""
 
@@ -69,15 +68,40 @@ class Mesh:
 
     @cached_property
     def colours(self) -> UInt8[np.ndarray, "v 3"]:
-        """Vertex colours; sampled from the texture where there is one, mid grey without either."""
-        if self.vertex_rgb is not None:
-            return self.vertex_rgb
+        """Colours at the vertices: the vertex colours, the texture, or their product; mid grey without either."""
         if self.uv is not None and self.texture_rgb is not None:
             h, w = self.texture_rgb.shape[:2]
             column = np.floor((self.uv[:, 0] % 1.0) * w).astype(int).clip(0, w - 1)
             row = np.floor((1.0 - self.uv[:, 1] % 1.0) * h).astype(int).clip(0, h - 1)
-            return np.asarray(self.texture_rgb[row, column])
-        return np.full((len(self.vertices_m), 3), 160, np.uint8)
+            sampled = np.asarray(self.texture_rgb[row, column])
+            if self.vertex_rgb is None:
+                return sampled
+            light = linear_from_display(sampled / 255.0) * linear_from_display(self.vertex_rgb / 255.0)
+            return to_bytes(display_from_linear(light))
+        if self.vertex_rgb is not None:
+            return self.vertex_rgb
+        return np.full((len(self.vertices_m), 3), GREY, np.uint8)
+
+    @cached_property
+    def drawn(self) -> "Mesh":
+        """The mesh for a renderer: without normals of its own, it has hard edges where faces meet at a large angle.
+
+        The vertices of the file stay as they are elsewhere, as errors are averages over them.
+        """
+        split = None if self.has_normals else split_creases(self.vertices_m, self.faces)
+        if split is None:
+            return self
+        rows, faces = split
+        vertices_m = self.vertices_m[rows]
+        return replace(
+            self,
+            vertices_m=vertices_m,
+            faces=faces.astype(np.int32),
+            normals=_unit(trimesh.Trimesh(vertices_m, faces, process=False).vertex_normals),
+            vertex_rgb=None if self.vertex_rgb is None else self.vertex_rgb[rows],
+            uv=None if self.uv is None else self.uv[rows],
+            has_normals=True,
+        )
 
     @cached_property
     def is_closed(self) -> bool:
@@ -132,47 +156,35 @@ def mesh_digest(mesh: Mesh) -> str:
 
 
 def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: bool = False) -> Mesh:
-    """Read a PLY, OBJ, glTF, GLB, STL or OFF file.
+    """Read a PLY, OBJ, glTF, GLB, STL or OFF file with its materials, as `posecore.mesh_files` reads them.
+
+    Several geometries in one file are merged, several textures become one, faces that lie on another are dropped, and
+    so are vertices without a face. Where a file has no normals, edges of more than
+    `posecore.mesh_files.creases.CREASE_DEG` are drawn hard; glTF without normals is flat, as it specifies.
 
     Args:
-        path: The file. Several geometries in one file are merged.
-        units: Unit of the file's coordinates. glTF is in metres by its specification: give `m`.
+        path: The file.
+        units: Unit of the file's coordinates; glTF is in metres by its specification, whatever is given here.
         allow_missing_textures: Whether a mesh whose texture or material file is missing or broken has its vertex
             colours or its material's plain colour instead.
 
     Raises:
-        MeshError: Missing, unreadable, without faces, with NaN vertices, with a face that names a vertex that is not
-            there, or of an absurd size in these units.
+        MeshError: Missing, unreadable, without faces or area, with NaN vertices, with a face that names a vertex that
+            is not there, of an absurd size in these units, or with a look that cannot be drawn as the file gives it.
+        TextureError: A file that a material names is missing.
     """
     file = Path(path)
-    if not file.is_file():
-        raise MeshError(f"{file}: no such mesh file; give the path of a .ply, .obj, .gltf, .glb or .stl file")
-    data = file.read_bytes()
-    if not data:
-        raise MeshError(f"{file}: the file is empty (0 bytes), expected a mesh; export it again")
-    if file.suffix.lower() == ".ply":
-        refuse_broken_ply(file, data)
-    geometry = _read(file)
-    vertices, faces = np.asarray(geometry.vertices, np.float64), np.asarray(geometry.faces, np.int32)
-    if not np.isfinite(vertices).all():
-        bad = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise MeshError(f"{file}: vertex {bad} is {vertices[bad].tolist()}, expected finite numbers; repair the mesh")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        bad = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))[0])
-        raise MeshError(
-            f"{file}: face {bad} names the vertices {faces[bad].tolist()}, expected 0 to {len(vertices) - 1}; "
-            "repair the mesh"
-        )
-    if not allow_missing_textures:
-        _refuse_missing_texture(file)
-    vertex_rgb, uv, texture_rgb = _appearance(file, geometry, allow_missing_textures)
+    data = mesh_bytes(file)
+    surface = read_surface(file, data, allow_missing_textures=allow_missing_textures)
+    units = "m" if file.suffix.lower() in METRE_SUFFIXES else units
     mesh = Mesh(
-        vertices_m=vertices * METRES_PER_UNIT[units],
-        faces=faces,
-        normals=_unit(np.asarray(geometry.vertex_normals, np.float64)),
-        vertex_rgb=vertex_rgb,
-        uv=uv,
-        texture_rgb=texture_rgb,
+        vertices_m=surface.vertices * METRES_PER_UNIT[units],
+        faces=surface.faces,
+        normals=_unit(surface.normals),
+        vertex_rgb=surface.rgb,
+        uv=surface.uv,
+        texture_rgb=surface.texture_rgb,
+        has_normals=surface.has_normals,
         path=str(file),
         sha256=hashlib.sha256(data).hexdigest(),
     )
@@ -186,33 +198,14 @@ def _unit(normals: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "v 3"]:
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0).astype(np.float32)
 
 
-def _read(file: Path) -> trimesh.Trimesh:
-    try:
-        # An OBJ's vertex on a texture seam becomes one vertex for each of its texture coordinates. With maintain_order
-        # it would keep a single coordinate, and the texture would smear along the seam.
-        loaded = trimesh.load(file, process=False)
-    except Exception as error:  # readers raise whatever they stumble over
-        reason = f"{type(error).__name__}: {str(error) or 'no reason given'}".splitlines()[0][:200]
-        raise MeshError(
-            f"{file}: cannot be read as a mesh ({reason}); expected a valid .ply, .obj, .gltf, .glb or .stl file"
-        ) from error
-    if isinstance(loaded, trimesh.Scene):
-        meshes = [g for g in loaded.dump() if isinstance(g, trimesh.Trimesh)]
-        if not meshes:
-            raise MeshError(f"{file}: holds no triangle mesh; export the surface, not points or curves")
-        loaded = meshes[0] if len(meshes) == 1 else trimesh.util.concatenate(meshes)
-    if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-        count = len(getattr(loaded, "vertices", ()))
-        raise MeshError(f"{file}: {count} vertices and no faces; a triangle mesh is needed, not a point cloud")
-    return loaded
-
-
 def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
     low, high = DIAMETER_RANGE_M
     if low <= diameter_m <= high:
         return
     fits = [u for u, s in METRES_PER_UNIT.items() if low <= diameter_m / METRES_PER_UNIT[units] * s <= high]
     meant = [f"--units {u} ({diameter_m / METRES_PER_UNIT[units] * METRES_PER_UNIT[u] * 1e3:.4g} mm)" for u in fits]
+    if file.suffix.lower() in METRE_SUFFIXES:
+        meant = []  # glTF has a unit
     hint = f"; did you mean {' or '.join(meant)}?" if meant else "; check the mesh's scale"
     raise MeshError(
         f"{file}: the diameter is {diameter_m * 1e3:.6g} mm when read in {units}, "
@@ -220,78 +213,16 @@ def _check_diameter(file: Path, diameter_m: float, units: str) -> None:
     )
 
 
-def _appearance(
-    file: Path, geometry: trimesh.Trimesh, allow_missing_textures: bool
-) -> tuple[UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, "v 2"] | None, UInt8[np.ndarray, "h w 3"] | None]:
-    visual: Any = geometry.visual
-    material = visual.material if isinstance(visual, trimesh.visual.TextureVisuals) else None
-    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    if image is not None and visual.uv is not None:
-        try:
-            return None, np.asarray(visual.uv, np.float32), np.asarray(image.convert("RGB"), np.uint8)
-        except OSError as error:
-            if not allow_missing_textures:
-                raise MeshError(f"{file}: its texture cannot be decoded ({error}); export it again") from error
-    if material is not None:
-        plain = np.asarray(material.main_color, np.uint8)[:3]
-        return np.tile(plain, (len(geometry.vertices), 1)), None, None
-    if visual.kind is None:
-        return None, None, None
-    return np.ascontiguousarray(np.asarray(visual.vertex_colors, np.uint8)[:, :3]), None, None
-
-
-def _refuse_missing_texture(file: Path) -> None:
-    """Refuse a material whose image is missing or no image: it would silently become grey."""
-    try:
-        textures = _textures(file)
-        missing = [texture for texture in textures if not texture.is_file()]
-    except MeshError:
-        raise
-    except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:  # a name that no file can have
-        raise MeshError(f"{file}: it names its texture in a way that cannot be read; export it again") from error
-    if missing:
-        raise TextureError(f"{file}: its texture {missing[0]} is missing; put it beside the mesh")
-    for texture in textures:
-        if not cv2.haveImageReader(str(texture)):
-            raise MeshError(f"{file}: its texture {texture} is not an image; export it again")
-
-
-def _textures(file: Path) -> list[Path]:
-    """Image files that a mesh file names."""
-    if file.suffix.lower() == ".gltf":
-        images = json.loads(file.read_text(encoding="utf-8")).get("images", ())
-        links = [image["uri"] for image in images if not image.get("uri", "data:").startswith("data:")]
-        return [file.parent / unquote(link) for link in links]
-    if file.suffix.lower() == ".ply":
-        header = file.read_bytes().split(b"end_header", 1)[0].decode("ascii", "replace").splitlines()
-        return [file.parent / line.split(maxsplit=2)[2].strip() for line in header if _names_texture(line)]
-    if file.suffix.lower() != ".obj":
-        return []
-    textures = []
-    for line in file.read_text(errors="replace").splitlines():
-        if not line.startswith("mtllib "):
-            continue
-        material = file.parent / line.split(maxsplit=1)[1].strip()
-        if not material.is_file():
-            raise TextureError(f"{file}: its material file {material} is missing; put it beside the mesh")
-        entries = material.read_text(errors="replace").splitlines()
-        textures += [file.parent / e.split(maxsplit=1)[1].strip() for e in entries if e.strip().startswith("map_Kd ")]
-    return textures
-
-
-def _names_texture(line: str) -> bool:
-    """Whether a line of a PLY's header names an image."""
-    return line.startswith("comment TextureFile ")
-
-
 def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
-    """Write a binary PLY with vertex normals and colours.
+    """Write a binary PLY with vertex colours, and with normals if the mesh has its own.
 
     A texture goes as a PNG of the same name beside it, named in the PLY as BOP's models do (`comment TextureFile`,
     texture_u, texture_v); the vertex colours are then the texture sampled at the vertices, for readers that take no
-    textures.
+    textures. A mesh with a texture and vertex colours keeps these, and a comment that they are a factor.
     """
-    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
+    columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    if mesh.has_normals:
+        columns += [("nx", "<f4"), ("ny", "<f4"), ("nz", "<f4")]
     textured = mesh.uv is not None and mesh.texture_rgb is not None
     if textured:
         columns += [("texture_u", "<f4"), ("texture_v", "<f4")]
@@ -299,14 +230,16 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
     vertices = np.empty(len(mesh.vertices_m), columns)
     for axis, name in enumerate("xyz"):
         vertices[name] = mesh.vertices_m[:, axis] / METRES_PER_UNIT[units]
-        vertices["n" + name] = mesh.normals[:, axis]
+        if mesh.has_normals:
+            vertices["n" + name] = mesh.normals[:, axis]
+    colours = mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb
     for channel, name in enumerate(("red", "green", "blue")):
-        vertices[name] = mesh.colours[:, channel]
+        vertices[name] = colours[:, channel]
     comment = ""
     if mesh.uv is not None and mesh.texture_rgb is not None:
         vertices["texture_u"], vertices["texture_v"] = mesh.uv[:, 0], mesh.uv[:, 1]
         texture = Path(path).with_suffix(".png")
-        comment = f"comment TextureFile {texture.name}\n"
+        comment = f"comment TextureFile {texture.name}\n" + ("" if mesh.vertex_rgb is None else f"{TIMES_COLOURS}\n")
         _, data = cv2.imencode(".png", mesh.texture_rgb[..., ::-1])
         write_atomic(texture, data.tobytes())  # before the PLY, which names it
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", (3,))])

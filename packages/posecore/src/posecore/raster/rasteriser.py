@@ -230,6 +230,7 @@ class Rasteriser:
         program["instance"].value = float(label)
         texture = self._textures.get(instance.obj_id)
         program["textured"].value = texture is not None
+        program["coloured"].value = mesh.vertex_rgb is not None
         (texture or self._blank).use(0)
         coloured.render(moderngl.TRIANGLES)
 
@@ -275,9 +276,11 @@ class Rasteriser:
         """The mesh as the two programs take it: with colours, and positions alone."""
         if obj_id in self._arrays:
             return self._arrays[obj_id]
+        mesh = mesh.drawn
         textured = mesh.uv is not None and mesh.texture_rgb is not None
         uv = np.zeros((len(mesh.vertices_m), 2)) if mesh.uv is None else mesh.uv
-        vertices = np.hstack([mesh.vertices_m, mesh.normals, mesh.colours / 255.0, uv]).astype("f4")
+        colours = mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb  # a factor where there is a texture
+        vertices = np.hstack([mesh.vertices_m, mesh.normals, colours / 255.0, uv]).astype("f4")
         layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
         positions = (self._context.buffer(np.ascontiguousarray(vertices[:, :3]).tobytes()), "3f", "position")
         index = self._context.buffer(mesh.faces.astype("i4").tobytes())

@@ -27,6 +27,7 @@ FRAGMENT_SHADER = """
 #version 330
 uniform sampler2D image;
 uniform bool textured;
+uniform bool coloured;
 uniform vec3 tint;
 uniform float ambient;
 uniform float diffuse;
@@ -40,6 +41,12 @@ in vec3 base;
 in vec2 texcoord;
 layout(location = 0) out vec4 rgb;
 layout(location = 1) out vec2 depth_instance;
+vec3 linear(vec3 c) {
+    return mix(c / 12.92, pow((c + 0.055) / 1.055, vec3(2.4)), vec3(greaterThan(c, vec3(0.04045))));
+}
+vec3 display(vec3 c) {
+    return mix(c * 12.92, 1.055 * pow(c, vec3(1.0 / 2.4)) - 0.055, vec3(greaterThan(c, vec3(0.0031308))));
+}
 void main() {
     vec3 to_eye = normalize(-p_cam);
     vec3 n = dot(n_cam, n_cam) > 1e-12 ? normalize(n_cam) : to_eye;
@@ -48,6 +55,7 @@ void main() {
     if (n_lights == 0) light += diffuse * dot(n, to_eye);
     for (int i = 0; i < n_lights; ++i) light += diffuse * light_rgb[i] * max(dot(n, light_direction[i]), 0.0);
     vec3 own = textured ? texture(image, texcoord).rgb : base;
+    if (textured && coloured) own = display(linear(own) * linear(base));
     rgb = vec4(min(own * tint * light, 1.0), 1.0);
     depth_instance = vec2(p_cam.z, instance);
 }

@@ -40,11 +40,11 @@ _SCENE_OPTIONS = (
         multiple=True,
         type=PATH,
         metavar="MESH|DIR",
-        help="Mesh of the object (.ply, .obj, .gltf, .glb, .stl), a folder of meshes, or a BOP models folder. "
+        help="Mesh of the object (.ply, .obj, .gltf, .glb, .stl, .off), a folder of meshes, or a BOP models folder. "
         "Repeatable: each scene shows a single object, all equally often. Files named obj_000005.ply keep their "
         "number.",
     ),
-    click.option("--units", type=UNITS, default="mm", help="Unit of the mesh's coordinates."),
+    click.option("--units", type=UNITS, default="mm", help="Unit of the mesh's coordinates; glTF is in metres."),
     click.option("--engine", type=ENGINE, help="Renderer of the scenes; raster needs no Blender. [preset]"),
     click.option(
         "--preset",

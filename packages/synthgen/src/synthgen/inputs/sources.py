@@ -10,6 +10,7 @@ from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
 from posecore.errors import ConfigError, DatasetError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
+from posecore.mesh_files import SUFFIXES
 
 from synthgen.image.background import list_photos
 from synthgen.image.hdri import list_hdris
@@ -17,7 +18,6 @@ from synthgen.inputs.assets import Assets
 
 log = logging.getLogger(__name__)
 
-MESH_SUFFIXES = (".ply", ".obj", ".gltf", ".glb", ".stl", ".off")
 MODELS_INFO = "models_info.json"
 LARGEST_OBJECT_ID = 2**31 - 1
 """Of the shards' field `obj_id`."""
@@ -30,7 +30,7 @@ class Sources:
 
     Attributes:
         objects: Meshes, folders of meshes (subfolders included), or BOP `models/` folders.
-        units: Unit of the meshes' coordinates; meshes of a BOP folder are always in mm.
+        units: Unit of the meshes' coordinates; meshes of a BOP folder are always in mm, glTF is always in m.
         backgrounds: Folder of photographs.
         hdris: Folder of panoramas.
         occluders: Folder of meshes, or one mesh.
@@ -205,7 +205,7 @@ def find_meshes(path: Path, units: Units, option: str) -> Sequence[tuple[Path, U
                 f"{option} {path}: {MODELS_INFO} has object numbers and there is no obj_XXXXXX.ply; name the meshes "
                 "like that, or let its keys be their names"
             )
-    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in MESH_SUFFIXES)
+    files = sorted(file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
     if not files:
-        raise ConfigError(f"{option} {path}: no mesh in this folder, expected {', '.join(MESH_SUFFIXES)} files")
+        raise ConfigError(f"{option} {path}: no mesh in this folder, expected {', '.join(SUFFIXES)} files")
     return [(file, units) for file in files]

@@ -12,7 +12,7 @@ PAINT, ADJUST, FINISH, PAINTED = "paint", "adjust", "finish", "painted"
 ACCENT, WAVE, WARP, BAND = "accent", "wave", "warp", "band"
 
 
-def make_surface(name: str, texture: bpy.types.Image | None) -> bpy.types.Material:
+def make_surface(name: str, texture: bpy.types.Image | None, *, has_colours: bool = False) -> bpy.types.Material:
     """Create the material of a mesh: original or painted colour -> hue, saturation, value -> Principled BSDF.
 
     The paint is a single colour or a pattern of two (`scene.Pattern`).
@@ -23,13 +23,14 @@ def make_surface(name: str, texture: bpy.types.Image | None) -> bpy.types.Materi
     Args:
         name: Names the datablock.
         texture: The mesh's texture; None takes its vertex colours.
+        has_colours: Whether its vertex colours are a factor on its texture.
     """
     block = bpy.data.materials.new(name)
     block.use_nodes = True
     tree = block.node_tree
     tree.nodes.clear()
     mix = tree.nodes.new("ShaderNodeMixRGB")
-    tree.links.new(_mesh_colour(tree, texture), mix.inputs["Color1"])
+    tree.links.new(_mesh_colour(tree, texture, has_colours), mix.inputs["Color1"])
     paint = tree.nodes.new("ShaderNodeMixRGB")
     tree.links.new(_attribute(tree, PAINT).outputs["Color"], paint.inputs["Color1"])
     tree.links.new(_attribute(tree, ACCENT).outputs["Color"], paint.inputs["Color2"])
@@ -71,17 +72,28 @@ def set_material(thing: bpy.types.Object, material: Material) -> None:
     thing.update_tag(refresh={"OBJECT"})
 
 
-def _mesh_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None) -> bpy.types.NodeSocket:
+def _mesh_colour(tree: bpy.types.NodeTree, texture: bpy.types.Image | None, has_colours: bool) -> bpy.types.NodeSocket:
     if texture is None:
-        vertex = tree.nodes.new("ShaderNodeVertexColor")
-        vertex.layer_name = COLOUR_ATTRIBUTE
-        return vertex.outputs["Color"]
+        return _vertex_colour(tree)
     uv = tree.nodes.new("ShaderNodeUVMap")
     uv.uv_map = UV_LAYER
     image = tree.nodes.new("ShaderNodeTexImage")
     image.image = texture
     tree.links.new(uv.outputs["UV"], image.inputs["Vector"])
-    return image.outputs["Color"]
+    if not has_colours:
+        return image.outputs["Color"]
+    product = tree.nodes.new("ShaderNodeMixRGB")
+    product.blend_type = "MULTIPLY"
+    product.inputs["Fac"].default_value = 1.0
+    tree.links.new(image.outputs["Color"], product.inputs["Color1"])
+    tree.links.new(_vertex_colour(tree), product.inputs["Color2"])
+    return product.outputs["Color"]
+
+
+def _vertex_colour(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
+    vertex = tree.nodes.new("ShaderNodeVertexColor")
+    vertex.layer_name = COLOUR_ATTRIBUTE
+    return vertex.outputs["Color"]
 
 
 def _pattern(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:

@@ -27,6 +27,8 @@ def make_mesh(key: int, mesh: Mesh) -> bpy.types.Mesh:
     """
     vertices, faces = np.asarray(mesh.vertices_m, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
     _check(mesh, vertices, faces)
+    mesh = mesh.drawn
+    vertices, faces = np.asarray(mesh.vertices_m, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
     block = bpy.data.meshes.new(f"mesh_{key}")
     block.vertices.add(len(vertices))
     block.vertices.foreach_set("co", vertices.ravel())
@@ -39,7 +41,8 @@ def make_mesh(key: int, mesh: Mesh) -> bpy.types.Mesh:
     block.normals_split_custom_set_from_vertices(_outward_normals(mesh))
     colours = block.color_attributes.new(COLOUR_ATTRIBUTE, "FLOAT_COLOR", "POINT")
     rgba = np.ones((len(vertices), 4), np.float32)
-    rgba[:, :3] = linear_from_srgb(mesh.colours / 255.0)
+    # Beside a texture they are a factor on it.
+    rgba[:, :3] = linear_from_srgb((mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb) / 255.0)
     colours.data.foreach_set("color", rgba.ravel())
     if mesh.uv is not None:
         layer = block.uv_layers.new(name=UV_LAYER)

@@ -38,7 +38,8 @@ class Props:
         """Make the meshes' datablocks; those of a loaded key are replaced and removed."""
         for key, mesh in meshes.items():
             block = make_mesh(key, mesh)
-            block.materials.append(make_surface(f"surface_{key}", make_texture(key, mesh)))
+            surface = make_surface(f"surface_{key}", make_texture(key, mesh), has_colours=mesh.vertex_rgb is not None)
+            block.materials.append(surface)
             old = self._meshes.get(key)
             self._meshes[key] = block
             self._boxes[key] = np.array(
