@@ -42,7 +42,7 @@ def cause(T_est, T_gt, info=None, limit_diameters=0.1, **columns):
     columns = {"add_m": 0.05, "adi_m": 0.05, "vss": 0.3, "mssd_m": 0.1, "diameter_m": DIAMETER_M} | columns
     table = errors_table(1, **columns)
     infos = None if info is None else {1: info}
-    (found,) = causes(table, T_est[None], T_gt[None], infos, limit_diameters=limit_diameters)
+    (found,) = causes(table, T_est[None], T_gt[None], np.zeros((1, 3)), infos, limit_diameters=limit_diameters)
     return found
 
 
@@ -154,7 +154,7 @@ def test_every_failure_has_exactly_one_cause_and_counts_add_up():
     T_est[~found] = np.nan
     add = rng.uniform(0.0, 0.03, rows)
     table = errors_table(rows, obj_id=rng.integers(1, 4, rows), found=found, add_m=add, vss=rng.uniform(size=rows))
-    chosen = causes(table, T_est, T_gt)
+    chosen = causes(table, T_est, T_gt, np.zeros((len(T_gt), 3)))
     failed = ~found | (add >= 0.1 * DIAMETER_M)
     assert (chosen[failed] != SOLVED).all()
     assert (chosen[~failed] == SOLVED).all()

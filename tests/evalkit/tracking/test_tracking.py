@@ -17,6 +17,7 @@ from evalkit.tracking import (
     track_scores,
 )
 from posecore import se3
+from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
 from posecore.symmetry import ContinuousSymmetry
 from scipy.spatial.transform import Rotation
@@ -27,6 +28,7 @@ def about(axis, degrees):
 
 
 X, Y, Z = np.eye(3)
+ORIGIN = np.zeros(3)
 
 
 def moving(frames, seed=0):
@@ -317,7 +319,7 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
     T_gt = moving(10)
     fails = {3: se3.apply_update(T_gt[3], about(X, 6.0), np.zeros(3)), 7: None}
     tracker = FakeTracker(T_gt, fails)
-    run = run_with_resets(tracker, iter(range(10)), T_gt)
+    run = run_with_resets(tracker, iter(range(10)), T_gt, center_m=ORIGIN)
     assert tracker.set_at == [0, 3, 7]
     assert np.flatnonzero(run.was_initialised).tolist() == [0, 3, 7]
     assert run.success == pytest.approx(7 / 9)
@@ -328,7 +330,7 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
 
 def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
     T_gt = moving(10)
-    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt)
+    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt, center_m=ORIGIN)
     scores = track_scores(track(run.T_est, T_gt, was_initialised=run.was_initialised))
     assert scores["success_5cm5deg"] == pytest.approx(run.success) == pytest.approx(7 / 9)
     assert (scores["resets"], scores["failed"]) == (2.0, 2.0)
@@ -340,19 +342,20 @@ def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
 def test_a_symmetric_copy_is_no_failure():
     T_gt = moving(4)
     copies = {frame: T_gt[frame] @ half_turn(Z) for frame in range(4)}
-    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, info=symmetric(half_turn(Z))).success == 1.0
-    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt).success == 0.0
+    info = ModelInfo(diameter_m=0.1, symmetries_discrete=(half_turn(Z),))
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, center_m=ORIGIN, info=info).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, center_m=ORIGIN).success == 0.0
 
 
 def test_sequences_that_cannot_be_tracked_are_refused():
     T_gt = moving(3)
     with pytest.raises(ConfigError, match="without frames"):
-        run_with_resets(FakeTracker(T_gt, {}), [], [])
+        run_with_resets(FakeTracker(T_gt, {}), [], [], center_m=ORIGIN)
     T_gt[1] = np.nan
     with pytest.raises(ConfigError, match="frame 1 has no ground-truth pose"):
-        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt)
+        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt, center_m=ORIGIN)
     with pytest.raises(ValueError, match="zip"):
-        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt)
+        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt, center_m=ORIGIN)
 
 
 def two_sequences(t_m, **rest):

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.errors import DatasetError, ResultFileError
 
@@ -76,7 +77,7 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
         matched: list[tuple[GroundTruth, Estimate | None]] = []
         for estimate in best[: len(instances)]:
             free = [gt for gt in instances if all(gt is not other for other, _ in matched)]
-            matched.append((min(free, key=lambda gt: _distance_m(estimate, gt)), estimate))
+            matched.append((_nearest(dataset, estimate, free), estimate))
         unmatched = [gt for gt in instances if all(gt is not other for other, _ in matched)]
         matched += [(gt, None) for gt in unmatched[: max(0, min(target.inst_count, len(instances)) - len(matched))]]
         pairs += [
@@ -87,8 +88,24 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
     return Pairing(pairs=pairs, ignored=len(result.estimates) - used)
 
 
-def _distance_m(estimate: Estimate, gt: GroundTruth) -> float:
-    return float(np.linalg.norm(estimate.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3]))
+def _nearest(dataset: BopDataset, estimate: Estimate, instances: Sequence[GroundTruth]) -> GroundTruth:
+    """The instance whose centre is nearest; of equal ones the first."""
+    if len(instances) == 1:
+        return instances[0]
+    distances_m = distances_of_centers_m(dataset, [estimate], instances)
+    return instances[int(distances_m[0].argmin())]
+
+
+def distances_of_centers_m(
+    dataset: BopDataset, estimates: Sequence[Estimate], instances: Sequence[GroundTruth]
+) -> Float[np.ndarray, "e i"]:
+    """Distances between the object's centre at estimates and at ground-truth poses of one object, metres."""
+    mesh = dataset.mesh(instances[0].obj_id, eval=True)
+    est, gt = (
+        mesh.center_cam_m(np.array([item.T_cam_obj for item in items], np.float64).reshape(-1, 4, 4))
+        for items in (estimates, instances)
+    )
+    return np.asarray(np.linalg.norm(est[:, None] - gt, axis=-1))
 
 
 def _by_key(estimates: Iterable[Estimate]) -> dict[Key, list[Estimate]]:

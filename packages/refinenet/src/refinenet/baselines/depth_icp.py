@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import small_gicp
 from jaxtyping import Float
+from posecore import se3
 from posecore.camera import back_project
 from posecore.errors import DatasetError
 
@@ -159,11 +160,8 @@ def _align(
     )
     if result.num_inliers < MIN_POINTS or not np.isfinite(result.T_target_source).all():
         return None
-    about_origin = np.eye(4)
-    about_origin[:3, 3] = middle_m
-    back = np.eye(4)
-    back[:3, 3] = -middle_m
-    return np.asarray(about_origin @ result.T_target_source @ back @ pose)
+    there, back = se3.make_T(np.eye(3), middle_m), se3.make_T(np.eye(3), -middle_m)
+    return np.asarray(there @ result.T_target_source @ back @ pose)
 
 
 def _points(patch: ObjectPatch, depth_m: Float[np.ndarray, "p p"], n: int) -> Float[np.ndarray, "m 3"]:

@@ -1,7 +1,7 @@
 """The last checkpoint of a run and the state to resume from."""
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,7 @@ class SavedRun:
 
 
 def load_run(config: TrainConfig, out: Path) -> SavedRun:
-    """The run in a folder.
+    """The run in a folder; one that an earlier version began keeps its pivot.
 
     Raises:
         ConfigError: A setting differs from the run's.
@@ -42,6 +42,8 @@ def load_run(config: TrainConfig, out: Path) -> SavedRun:
     """
     last = checkpoint.load(out / "last.safetensors", config.preset)
     before = last.provenance.config
+    if before.pivot == "origin":
+        config = replace(config, pivot=before.pivot)
     checkpoint.require_same(before, config, last.path)
     if config.optimiser.schedule == "cosine" and before.steps != config.steps:
         rates = [learning_rate(last.provenance.step, c.steps, c.optimiser) for c in (before, config)]

@@ -11,7 +11,8 @@ from posecore.camera import project
 from posecore.contour import contour_mask
 from posecore.errors import ConfigError, ShardError
 from posecore.files import write_atomic
-from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
+from posecore.mesh import Mesh
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader, load_meshes
 
 Image = UInt8[np.ndarray, "h w 3"]
 
@@ -40,6 +41,7 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         ShardError: Nothing to show.
     """
     reader = ShardReader(url)
+    meshes = load_meshes(reader)
     rows = []
     for shard_id in reader.committed:
         start = shard_id * reader.shard_size
@@ -48,7 +50,7 @@ def contact_sheet(url: str, count: int, *, first: int = 0) -> Image:
         if not indices:
             continue
         samples = reader.read(shard_id)
-        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in indices]
+        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i, meshes) for i in indices]
     if not rows:
         rendered = sum(map(reader.n_samples, reader.committed))
         raise ShardError(f"{url}: no rendered sample from {first} on; {rendered} of {reader.n} samples are rendered")
@@ -75,8 +77,8 @@ def save_contact_sheet(url: str, file: Path, count: int, *, first: int = 0) -> t
     return sheet.shape[1], sheet.shape[0]
 
 
-def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
-    """Row of a contact sheet from the fields of a sample."""
+def sample_row(sample: Mapping[str, np.ndarray], index: int, meshes: Mapping[int, Mesh]) -> Image:
+    """Row of a contact sheet from the fields of a sample and the dataset's meshes by object id."""
     K = sample["K_crop"]
     scale = CELL_PX / sample["scene_rgb"].shape[0]
     uv_scene = project(K, sample["scene_contour_cam_m"].astype(np.float64)) * scale
@@ -92,7 +94,13 @@ def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
     ]
     R = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
     angle = np.rad2deg(se3.rotation_angle_rad(R))
-    shift_mm = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
+    mesh = meshes.get(int(sample["obj_id"]))  # none in a damaged dataset
+    moved_m = (
+        np.nan
+        if mesh is None
+        else mesh.center_cam_m(sample["T_cam_obj_hypothesis"]) - mesh.center_cam_m(sample["T_cam_obj"])
+    )
+    shift_mm = 1e3 * np.linalg.norm(moved_m)
     caption = (
         f"sample {index}  scene {sample['scene_index']}  object {sample['obj_id']}  hypothesis off by {angle:.1f} deg, "
         f"{shift_mm:.1f} mm  visible {sample['visible_fraction']:.2f}  rejected {sample['rejected']}"
