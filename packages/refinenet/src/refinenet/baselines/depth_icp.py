@@ -26,6 +26,9 @@ MIN_SUPPORT = 0.1
 SUPPORT = 0.05
 """A depth is confirmed within this fraction of the diameter."""
 STEPS = 10
+GRID_M = 2.0**-24
+"""Points are rounded to 60 nm. Neighbours in a depth image are equally far from a point: without that, the last bits of
+floats would decide which are the nearest, and the pose would depend on them by micrometres."""
 
 
 class DepthIcp(Baseline):
@@ -148,7 +151,9 @@ def _align(
     scene = scene[np.linalg.norm(scene - middle_m, axis=1) < diameter_m / 2 + reach_m]
     if len(model) < MIN_POINTS or len(scene) < MIN_POINTS:
         return None
-    source, goal = small_gicp.PointCloud(model - middle_m), small_gicp.PointCloud(scene - middle_m)
+    source, goal = (
+        small_gicp.PointCloud(np.round((points - middle_m) / GRID_M) * GRID_M) for points in (model, scene)
+    )
     small_gicp.estimate_normals(goal, num_neighbors=NEIGHBOURS)
     result = small_gicp.align(
         goal,
