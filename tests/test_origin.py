@@ -32,6 +32,8 @@ from posecore.symmetry import ContinuousSymmetry
 from refinenet.cli import main as refinenet
 from refinenet.models import checkpoint
 from synthgen.cli import main as synthgen
+from synthgen.engines.make import make_engine
+from synthgen.scene import Light, Material, Pattern, Scene, SceneObject
 
 SHIFT_M = np.array([2.0, -1.0, 0.5])
 """Position of the plain mesh's origin in the shifted mesh's frame."""
@@ -366,3 +368,27 @@ def test_training_is_the_same(pairs, preset, settings, tmp_path):
     for a, b in zip(*logs, strict=True):
         for key in keys & set(a):
             assert b[key] == pytest.approx(a[key], rel=1e-5), key
+
+
+PATTERN = Pattern(accent_rgb=(0.9, 0.2, 0.1), wave=(150.0, 80.0, -60.0), warp=(40.0, -90.0, 30.0))
+
+
+@pytest.mark.parametrize("name", ["raster", pytest.param("cycles", marks=pytest.mark.slow)])
+def test_an_engine_draws_a_copy_alike_bit_for_bit(name, meshes):
+    """Patterns and lamps are about the centre; coordinates are exact in binary here."""
+    exact = replace(meshes[TUG], vertices_m=np.round(meshes[TUG].vertices_m * 2**20) / 2**20)
+    T = se3.make_T(se3.random_rotation(np.random.default_rng(4)), np.array([0.01, -0.02, 0.5]))
+    lamp = Light(kind="point", position_cam_m=(-0.4, 0.1, 0.1), strength=3.0)
+    layers = []
+    for mesh, pose in ((exact, T), (shifted(exact), se3.with_origin_at(T, -SHIFT_M))):
+        engine = make_engine(name)
+        engine.load({1: mesh})
+        thing = SceneObject(mesh_key=1, T_cam_obj=pose, material=Material(base_rgb=(0.2, 0.5, 0.8), pattern=PATTERN))
+        region = (0, 0, CAMERA.width_px, CAMERA.height_px)
+        scene = Scene(camera=CAMERA, region_px=region, objects=(thing,), lights=(lamp,), samples=4)
+        layers.append(engine.render(scene))
+        engine.close()
+    plain, other = layers
+    assert (plain.index == 0).any()
+    for field in ("rgb_linear", "alpha", "depth_m", "index"):
+        np.testing.assert_array_equal(getattr(other, field), getattr(plain, field), err_msg=field)

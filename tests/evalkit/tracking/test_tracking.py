@@ -420,3 +420,14 @@ def test_the_papers_layout_has_six_rows_a_sequence_and_a_column_a_method():
     ]
     assert [table.rows[2].cells[key] for key in ("rms_0", "rms_1")] == pytest.approx([0.0, 3.0], abs=1e-9)
     assert {(0, "rms_1"), (2, "rms_0")} <= best_cells(table)
+
+
+def test_a_turn_about_the_centre_is_no_translation():
+    """With the origin 2 m off, a turn of 4 degrees moves the origin by 14 cm, and is tracked all the same."""
+    center_m, T_gt = np.array([2.0, 0.0, 0.0]), moving(4)
+    T_gt = se3.with_origin_at(T_gt, -center_m)
+    turned = se3.with_origin_at(off(se3.with_origin_at(T_gt, center_m), about(Z, 4.0)), -center_m)
+    assert np.linalg.norm(turned[:, :3, 3] - T_gt[:, :3, 3], axis=1).max() > 0.05
+    poses = dict(enumerate(turned))
+    assert run_with_resets(FakeTracker(T_gt, poses), range(4), T_gt, center_m=center_m).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, poses), range(4), T_gt, center_m=ORIGIN).success == 0.0

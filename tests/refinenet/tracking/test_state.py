@@ -218,3 +218,27 @@ def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
         found = Refinement(T_cam_obj=pose(0), status=status, iterations=1, confidence=0.0, failure="gone")
         told = track.update(frame, [found])
         assert (told.state, told.T_cam_obj is None) == (state, status is Status.FAILED)
+
+
+def test_depths_and_motion_are_about_the_centre():
+    """A mesh with its origin 2 m off: the centre stays on its ray, and goes on straight."""
+    shift_m = np.array([2.0, -1.0, 0.5])
+    far = {1: SMALL[1].with_origin_at(-shift_m)}
+    center_m = far[1].center_m
+    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03), center_m=center_m)
+    T = se3.with_origin_at(pose(8), -shift_m)
+    track.hypotheses(0, [T])
+    track.update(0, [Refinement(T_cam_obj=T, status=Status.CONVERGED, iterations=1, confidence=0.9)])
+    tried = np.stack([far[1].center_cam_m(request.T_cam_obj) for request in track.hypotheses(1, [])])
+    at_m = far[1].center_cam_m(T)
+    np.testing.assert_allclose(tried, at_m * np.array([[1.0], [0.97], [1.03]]), atol=1e-12)
+
+    turn, step_m = se3.rotation_from_rotvec(np.array([0.1, 0.2, -0.1])), np.array([0.01, 0.0, 0.002])
+
+    def moved(T_cam_obj):
+        return se3.with_origin_at(se3.apply_update(se3.with_origin_at(T_cam_obj, center_m), turn, step_m), -center_m)
+
+    refiner = Script([0.9] * 4, moved=moved, meshes=far)
+    tracker = Tracker(refiner, [1], CONFIG, motion_model=True)
+    found = [tracker.step(i, EMPTY, {1: [T]})[0].T_cam_obj for i in range(3)]
+    np.testing.assert_allclose(refiner.asked[2][0], moved(found[1]), atol=1e-9)

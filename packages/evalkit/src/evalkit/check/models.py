@@ -56,7 +56,7 @@ def centers_m(dataset: BopDataset, obj_ids: Iterable[int]) -> dict[int, Float[np
     centers = {}
     for obj_id in obj_ids:
         try:
-            centers[obj_id] = dataset.mesh(obj_id, eval=True).center_m
+            centers[obj_id] = dataset.center_m(obj_id)
         except PoseError:
             centers[obj_id] = np.zeros(3)
     return centers

@@ -73,7 +73,7 @@ def score_file(
         table=table,
         T_est=_stacked([NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]),
         T_gt=_stacked([pair.gt.T_cam_obj for pair in pairing.pairs]),
-        center_m=np.array([evaluator.mesh(pair.gt.obj_id).center_m for pair in pairing.pairs]).reshape(-1, 3),
+        center_m=np.array([evaluator.dataset.center_m(pair.gt.obj_id) for pair in pairing.pairs]).reshape(-1, 3),
         ignored=pairing.ignored,
         precision=precision,
     )

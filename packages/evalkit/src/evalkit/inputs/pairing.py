@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from posecore import se3
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.errors import DatasetError, ResultFileError
 
@@ -100,12 +101,12 @@ def distances_of_centers_m(
     dataset: BopDataset, estimates: Sequence[Estimate], instances: Sequence[GroundTruth]
 ) -> Float[np.ndarray, "e i"]:
     """Distances between the object's centre at estimates and at ground-truth poses of one object, metres."""
-    mesh = dataset.mesh(instances[0].obj_id, eval=True)
+    center_m = dataset.center_m(instances[0].obj_id)
     est, gt = (
-        mesh.center_cam_m(np.array([item.T_cam_obj for item in items], np.float64).reshape(-1, 4, 4))
+        se3.with_origin_at(np.array([item.T_cam_obj for item in items], np.float64).reshape(-1, 4, 4), center_m)
         for items in (estimates, instances)
     )
-    return np.asarray(np.linalg.norm(est[:, None] - gt, axis=-1))
+    return np.asarray(np.linalg.norm(est[:, None, :3, 3] - gt[:, :3, 3], axis=-1))
 
 
 def _by_key(estimates: Iterable[Estimate]) -> dict[Key, list[Estimate]]:

@@ -173,7 +173,7 @@ def perturb_dataset(
     rows: list[dict[str, Any]] = []
     for target in dataset.targets:
         diameter_m = dataset.models_info[target.obj_id].diameter_m
-        center_m = dataset.mesh(target.obj_id, eval=True).center_m  # of the mesh that errors are measured on
+        center_m = dataset.center_m(target.obj_id)
         for gt in instances_of(dataset, target)[: target.inst_count]:
             rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, gt.gt_index])
             drawn = [_drawn(random_up_to, rng)] if random_up_to else []

@@ -22,10 +22,17 @@ ERRORS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A mesh for pose errors, with its convex hull, symmetries and neighbour search, in the object's own frame."""
+    """A mesh for pose errors, with its convex hull, symmetries and neighbour search, in the object's own frame.
+
+    Attributes:
+        mesh: its vertices are the model points.
+        info: diameter and symmetries.
+        center_m: the object's centre: that of the full model where `mesh` is a simplified one.
+    """
 
     mesh: Mesh
     info: ModelInfo
+    center_m: Float[np.ndarray, "3"]
     nearest: NearestPoints = field(init=False)
     hull_m: Float[np.ndarray, "h 3"] = field(init=False)
     symmetries: Float[np.ndarray, "s 4 4"] = field(init=False)
@@ -38,7 +45,7 @@ class Model:
 
     def of_center(self, T_cam_obj: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
         """Poses of the object's centre: the same axes, the origin at the centre."""
-        return se3.with_origin_at(T_cam_obj, self.mesh.center_m)
+        return se3.with_origin_at(T_cam_obj, self.center_m)
 
     def symmetries_of(
         self, T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"]

@@ -98,7 +98,8 @@ class Scorer:
         if obj_id not in self._models:
             if obj_id not in self.dataset.models_info:
                 raise DatasetError(f"{self.dataset.root}: models_info.json has no object {obj_id}; add its diameter")
-            model = Model(mesh=self.dataset.mesh(obj_id, eval=True), info=self.dataset.models_info[obj_id])
+            mesh, info = self.dataset.mesh(obj_id, eval=True), self.dataset.models_info[obj_id]
+            model = Model(mesh=mesh, info=info, center_m=self.dataset.center_m(obj_id))
             self.rasteriser.add(obj_id, model.mesh)
             self._models[obj_id] = model
         return self._models[obj_id]

@@ -88,7 +88,7 @@ def tracks_of(
                 f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of the object; "
                 "a tracked sequence has one (perturbed initial poses are for `evalkit report`)"
             )
-        center_m = dataset.mesh(int(obj_id), eval=True).center_m
+        center_m = dataset.center_m(int(obj_id))
         mark = f", instance {instance + 1}" if (scene_id, obj_id) in several else ""
         tracks.append(
             SequenceTrack(

@@ -151,9 +151,7 @@ def _align(
     scene = scene[np.linalg.norm(scene - middle_m, axis=1) < diameter_m / 2 + reach_m]
     if len(model) < MIN_POINTS or len(scene) < MIN_POINTS:
         return None
-    source, goal = (
-        small_gicp.PointCloud(np.round((points - middle_m) / GRID_M) * GRID_M) for points in (model, scene)
-    )
+    source, goal = (small_gicp.PointCloud(np.round((points - middle_m) / GRID_M) * GRID_M) for points in (model, scene))
     small_gicp.estimate_normals(goal, num_neighbors=NEIGHBOURS)
     result = small_gicp.align(
         goal,
