@@ -17,7 +17,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from posecore.shard import load_meshes
 from refinenet.config import TrainConfig, load_config
 from refinenet.data.objects import load_models, object_points
 from refinenet.data.pair_stream import PairSource
@@ -56,11 +55,11 @@ def render(arguments: argparse.Namespace, out: Path, n: int, count: int, seed: i
 def measure(config: TrainConfig, run: Path, test: Path) -> dict[str, float]:
     """Errors of the run's last network on the test pairs."""
     source = PairSource(str(test), config, training=False)
-    reader = source.reader
+    reader, frames = source.reader, source.frames
     rows = {shard_id: np.arange(reader.n_samples(shard_id)) for shard_id in reader.committed}
     split = spread_rows(Split(rows=rows, scenes=reader.n), TEST_PAIRS)
     objects: ObjectPoints = object_points(
-        load_meshes(reader), load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg
+        frames.meshes, frames.models(load_models(reader)), config.loss.model_points, config.loss.symmetry_step_deg
     )
     network = checkpoint.load(run / "last.safetensors").network()
     device = choose_device("cpu")

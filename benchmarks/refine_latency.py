@@ -79,7 +79,8 @@ def scene(mesh: Mesh) -> tuple[Frame, np.ndarray]:
 
 def iteration_ms(refiner: Refiner, frame: Frame, requests: list[Request]) -> dict[str, float]:
     """Time of one iteration, of its two parts, and of a whole refinement."""
-    T, obj_id = np.stack([r.T_cam_obj for r in requests]), np.array([r.obj_id for r in requests])
+    pivots = refiner.frames.requests(requests)
+    T, obj_id = np.stack([r.T_cam_obj for r in pivots]), np.array([r.obj_id for r in pivots])
     began = time.perf_counter()
     patches = refiner.patch_renderer.render_and_crop(frame, T, obj_id)
     rendered = time.perf_counter()

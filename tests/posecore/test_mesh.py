@@ -207,3 +207,13 @@ def test_the_box_centre_in_the_camera_is_that_of_each_pose(tmp_path: Path) -> No
     assert found.shape == (2, 3, 3)
     np.testing.assert_allclose(found, se3.apply(T, cube.center_m[None])[..., 0, :], atol=1e-12)
     np.testing.assert_array_equal(cube.center_cam_m(T[1, 2]), T[1, 2, :3, :3] @ cube.center_m + T[1, 2, :3, 3])
+
+
+def test_the_centre_is_that_of_the_vertices_that_faces_use(tmp_path: Path) -> None:
+    mesh = load_mesh(write_box(tmp_path / "box.ply"))
+    stray = np.vstack([mesh.vertices_m, [[0.4, 0.0, 0.0]]])
+    with_stray = Mesh(vertices_m=stray, faces=mesh.faces, normals=np.vstack([mesh.normals, [[0, 0, 1]]]))
+    np.testing.assert_allclose(with_stray.center_m, mesh.center_m, atol=1e-12)
+    moved = mesh.with_origin_at(np.array([2.0, -1.0, 0.5]))
+    np.testing.assert_allclose(moved.center_m, mesh.center_m - [2.0, -1.0, 0.5], atol=1e-12)
+    assert moved.diameter_m == pytest.approx(mesh.diameter_m, rel=1e-12)

@@ -82,3 +82,12 @@ def test_perturb_has_the_asked_angle_and_length() -> None:
     dR, dt = se3.update_between(T, moved)
     assert se3.rotation_angle_rad(dR) == pytest.approx(0.3, abs=1e-12)
     assert np.linalg.norm(dt) == pytest.approx(0.05, abs=1e-12)
+
+
+def test_an_origin_elsewhere_is_the_same_pose_and_comes_back() -> None:
+    T, points_m = np.stack([random_pose(RNG) for _ in range(5)]), RNG.normal(size=(5, 3))
+    moved = se3.with_origin_at(T, points_m)
+    np.testing.assert_allclose(moved, T @ se3.make_T(np.broadcast_to(np.eye(3), (5, 3, 3)), points_m), atol=1e-15)
+    np.testing.assert_allclose(se3.with_origin_at(moved, -points_m), T, atol=1e-15)
+    for i in range(5):  # bit for bit the same without the others
+        assert np.array_equal(se3.with_origin_at(T[i], points_m[i]), moved[i])

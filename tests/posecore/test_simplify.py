@@ -63,3 +63,12 @@ def test_small_and_textured_meshes_stay_as_they_are(dense):
 
 def test_a_mesh_without_colours_has_none_afterwards(dense):
     assert simplified(replace(dense, vertex_rgb=None), 1000).vertex_rgb is None
+
+
+def test_a_mesh_and_its_copy_with_another_origin_are_simplified_alike(dense):
+    exact = replace(dense, vertices_m=np.round(dense.vertices_m * 2**30) / 2**30)
+    shift_m = np.array([2.0, -1.0, 0.5])
+    plain, other = simplified(exact, 1000), simplified(exact.with_origin_at(-shift_m), 1000)
+    np.testing.assert_allclose(other.vertices_m - shift_m, plain.vertices_m, rtol=0, atol=1e-15)
+    np.testing.assert_array_equal(other.faces, plain.faces)
+    np.testing.assert_array_equal(other.vertex_rgb, plain.vertex_rgb)

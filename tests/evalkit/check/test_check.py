@@ -215,8 +215,13 @@ DATASET_FAULTS = {
         "image 4, entry 1: 'obj_id' is None, expected an",
     ),
     "strange id": (set_entry(GT, "4", 1, obj_id=77), "error", "unknown-object", "entry 1: 'obj_id' is 77, models_info"),
-    "behind": (set_entry(GT, "4", 1, cam_t_m2c=[0, 0, -500]), "error", "behind-camera", "entry 1: t_z is -500 mm"),
-    "metres": (scale_translations(0.001), "error", "units", r"median t_z of 6 ground-truth poses is 0\.5.*metres\?"),
+    "behind": (
+        set_entry(GT, "4", 1, cam_t_m2c=[0, 0, -500]),
+        "error",
+        "behind-camera",
+        r"entry 1: the object's centre is at z = -5\d\d.* mm, expected",
+    ),
+    "metres": (scale_translations(0.001), "error", "units", r"length of t of 6 ground-truth poses is 0\.5.*metres\?"),
     "rough": (
         set_entry(GT, "4", 0, cam_R_m2c=[1.002, 0, 0, 0, 1.002, 0, 0, 0, 1.002]),
         "warning",
@@ -443,7 +448,7 @@ RESULT_FAULTS = {
     "scene": ([GOOD, f"9,0,1,1,{R},{T},-1"], "error", "line-scene_id", ":3: scene 9 is not in"),
     "image": ([GOOD, f"3,9,1,1,{R},{T},-1"], "error", "line-im_id", ":3: image 9 has no ground truth in"),
     "object": ([GOOD, f"3,0,9,1,{R},{T},-1"], "error", "line-obj_id", ":3: object 9 is unknown, toys has 1, 5"),
-    "metres": ([f"3,0,1,1,{R},0.01 0.02 0.5,-1"], "error", "units", r"median t_z of the file is 0.5.*\(metres\?\)"),
+    "metres": ([f"3,0,1,1,{R},0.01 0.02 0.5,-1"], "error", "units", r"length of t in the file is 0.5.*\(metres\?\)"),
     "repeated": ([GOOD, GOOD], "warning", "duplicate", ":3: repeats the estimate of line 2"),
     "times": (
         [f"3,0,1,1,{R},{T},1.5", f"3,0,5,1,{R},{T},2"],
@@ -463,7 +468,12 @@ RESULT_FAULTS = {
         "superfluous",
         r":2: the targets ask for 1 of object 1 here \(it is ignored\)",
     ),
-    "behind": ([f"3,0,1,1,{R},10 20 -500,-1"], "warning", "behind-camera", ":2: t_z is -500 mm, the object is behind"),
+    "behind": (
+        [f"3,0,1,1,{R},10 20 -500,-1"],
+        "warning",
+        "behind-camera",
+        r":2: the object's centre is at z = -5\d\d.* mm, behind",
+    ),
     "off image": (
         [f"3,0,1,1,{R},5000 20 500,-1"],
         "warning",

@@ -264,7 +264,7 @@ def test_a_file_is_compared_with_the_start_poses_it_came_from():
     def scored(name, **sidecar):
         file = ResultFile(name=name, path=Path(f"{name}.csv"), sha256="", sidecar=sidecar, estimates=[])
         none = np.zeros((0, 4, 4))
-        return Scored(file=file, table=table_of({}), T_est=none, T_gt=none, ignored=0)
+        return Scored(file=file, table=table_of({}), T_est=none, T_gt=none, center_m=np.zeros((0, 3)), ignored=0)
 
     initial_poses = [scored("near", method="initial"), scored("far", method="initial")]
     assert initial_of(scored("a", init="far.csv"), initial_poses) is initial_poses[1]

@@ -42,7 +42,7 @@ def cause(T_est, T_gt, info=None, limit_diameters=0.1, **columns):
     columns = {"add_m": 0.05, "adi_m": 0.05, "vss": 0.3, "mssd_m": 0.1, "diameter_m": DIAMETER_M} | columns
     table = errors_table(1, **columns)
     infos = None if info is None else {1: info}
-    (found,) = causes(table, T_est[None], T_gt[None], infos, limit_diameters=limit_diameters)
+    (found,) = causes(table, T_est[None], T_gt[None], np.zeros((1, 3)), infos, limit_diameters=limit_diameters)
     return found
 
 
@@ -154,7 +154,7 @@ def test_every_failure_has_exactly_one_cause_and_counts_add_up():
     T_est[~found] = np.nan
     add = rng.uniform(0.0, 0.03, rows)
     table = errors_table(rows, obj_id=rng.integers(1, 4, rows), found=found, add_m=add, vss=rng.uniform(size=rows))
-    chosen = causes(table, T_est, T_gt)
+    chosen = causes(table, T_est, T_gt, np.zeros((len(T_gt), 3)))
     failed = ~found | (add >= 0.1 * DIAMETER_M)
     assert (chosen[failed] != SOLVED).all()
     assert (chosen[~failed] == SOLVED).all()
@@ -164,3 +164,20 @@ def test_every_failure_has_exactly_one_cause_and_counts_add_up():
     assert counts.loc[["1", "2", "3"]].sum().tolist() == counts.loc["total"].tolist()
     assert counts.loc["total", "missed"] == (~found).sum()
     assert counts.loc["total", "expected"] == rows
+
+
+def test_causes_do_not_depend_on_where_the_origin_lies():
+    """An object turned out of the plane about its centre: the rotation is the only error; not so about the origin."""
+    info = ModelInfo(diameter_m=DIAMETER_M, symmetries_continuous=(ContinuousSymmetry((0, 0, 1), (0, 0, 0)),))
+    T_gt = gt_pose()
+    T_est = moved(T_gt, axis=across(T_gt), degrees=60.0)
+    origin_m = np.array([-2.0, 1.0, -0.5])
+    table = errors_table(1, add_m=0.05, adi_m=0.05, vss=0.3, mssd_m=0.1, diameter_m=DIAMETER_M)
+    for name, item in (("plain", None), ("of revolution", info)):
+        shifted = None if item is None else {1: item.with_origin_at(origin_m)}
+        poses = [se3.with_origin_at(T, origin_m)[None] for T in (T_est, T_gt)]
+        (found,) = causes(table, *poses, -origin_m[None], shifted)
+        (plain,) = causes(table, T_est[None], T_gt[None], np.zeros((1, 3)), None if item is None else {1: item})
+        assert found == plain == "rotation only", name
+        (about_origin,) = causes(table, *poses, np.zeros((1, 3)), shifted)
+        assert about_origin == "large", name

@@ -17,6 +17,7 @@ from evalkit.tracking import (
     track_scores,
 )
 from posecore import se3
+from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
 from posecore.symmetry import ContinuousSymmetry
 from scipy.spatial.transform import Rotation
@@ -27,6 +28,7 @@ def about(axis, degrees):
 
 
 X, Y, Z = np.eye(3)
+ORIGIN = np.zeros(3)
 
 
 def moving(frames, seed=0):
@@ -317,7 +319,7 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
     T_gt = moving(10)
     fails = {3: se3.apply_update(T_gt[3], about(X, 6.0), np.zeros(3)), 7: None}
     tracker = FakeTracker(T_gt, fails)
-    run = run_with_resets(tracker, iter(range(10)), T_gt)
+    run = run_with_resets(tracker, iter(range(10)), T_gt, center_m=ORIGIN)
     assert tracker.set_at == [0, 3, 7]
     assert np.flatnonzero(run.was_initialised).tolist() == [0, 3, 7]
     assert run.success == pytest.approx(7 / 9)
@@ -328,7 +330,7 @@ def test_a_tracker_that_fails_is_set_to_the_truth_of_that_frame_and_goes_on():
 
 def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
     T_gt = moving(10)
-    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt)
+    run = run_with_resets(FakeTracker(T_gt, {4: None, 5: None}), range(10), T_gt, center_m=ORIGIN)
     scores = track_scores(track(run.T_est, T_gt, was_initialised=run.was_initialised))
     assert scores["success_5cm5deg"] == pytest.approx(run.success) == pytest.approx(7 / 9)
     assert (scores["resets"], scores["failed"]) == (2.0, 2.0)
@@ -340,19 +342,20 @@ def test_a_result_file_of_a_reset_run_scores_as_the_run_did():
 def test_a_symmetric_copy_is_no_failure():
     T_gt = moving(4)
     copies = {frame: T_gt[frame] @ half_turn(Z) for frame in range(4)}
-    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, info=symmetric(half_turn(Z))).success == 1.0
-    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt).success == 0.0
+    info = ModelInfo(diameter_m=0.1, symmetries_discrete=(half_turn(Z),))
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, center_m=ORIGIN, info=info).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, copies), range(4), T_gt, center_m=ORIGIN).success == 0.0
 
 
 def test_sequences_that_cannot_be_tracked_are_refused():
     T_gt = moving(3)
     with pytest.raises(ConfigError, match="without frames"):
-        run_with_resets(FakeTracker(T_gt, {}), [], [])
+        run_with_resets(FakeTracker(T_gt, {}), [], [], center_m=ORIGIN)
     T_gt[1] = np.nan
     with pytest.raises(ConfigError, match="frame 1 has no ground-truth pose"):
-        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt)
+        run_with_resets(FakeTracker(T_gt, {}), range(3), T_gt, center_m=ORIGIN)
     with pytest.raises(ValueError, match="zip"):
-        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt)
+        run_with_resets(FakeTracker(T_gt, {}), range(1), T_gt, center_m=ORIGIN)
 
 
 def two_sequences(t_m, **rest):
@@ -417,3 +420,14 @@ def test_the_papers_layout_has_six_rows_a_sequence_and_a_column_a_method():
     ]
     assert [table.rows[2].cells[key] for key in ("rms_0", "rms_1")] == pytest.approx([0.0, 3.0], abs=1e-9)
     assert {(0, "rms_1"), (2, "rms_0")} <= best_cells(table)
+
+
+def test_a_turn_about_the_centre_is_no_translation():
+    """With the origin 2 m off, a turn of 4 degrees moves the origin by 14 cm, and is tracked all the same."""
+    center_m, T_gt = np.array([2.0, 0.0, 0.0]), moving(4)
+    T_gt = se3.with_origin_at(T_gt, -center_m)
+    turned = se3.with_origin_at(off(se3.with_origin_at(T_gt, center_m), about(Z, 4.0)), -center_m)
+    assert np.linalg.norm(turned[:, :3, 3] - T_gt[:, :3, 3], axis=1).max() > 0.05
+    poses = dict(enumerate(turned))
+    assert run_with_resets(FakeTracker(T_gt, poses), range(4), T_gt, center_m=center_m).success == 1.0
+    assert run_with_resets(FakeTracker(T_gt, poses), range(4), T_gt, center_m=ORIGIN).success == 0.0

@@ -45,8 +45,10 @@ def rewrite_as_old(out):
     for path in out.glob("*.safetensors"):
         with safe_open(path, "pt") as opened:
             metadata = opened.metadata()
-        metadata["config"] = json.dumps(old_config(json.loads(metadata["config"])))
-        save_file(load_file(path), path, metadata)
+        config = json.loads(metadata["config"])
+        assert config.pop("pivot") == "origin"
+        metadata["config"] = json.dumps(old_config(config))
+        save_file(load_file(path), path, metadata | {"version": "1"})
     (path,) = out.glob("optimiser-*.pt")
     state = torch.load(path, weights_only=True)
     state["held_out_shards"] = state.pop("validation_shards")
@@ -79,10 +81,11 @@ def test_the_shipped_checkpoints_load(name, target):
 @pytest.mark.slow
 def test_a_run_of_the_version_before_resumes_as_it_would_have_gone_on(dataset, tmp_path):
     options = ["optimiser.ema_decay=0.9", "optimiser.schedule=constant", "checkpoint_every=3", "log_every=1"]
-    train(small(*options, "steps=6"), str(dataset), tmp_path / "whole")
-    train(small(*options, "steps=3"), str(dataset), tmp_path / "old")
+    train(small(*options, "steps=6", "pivot=origin"), str(dataset), tmp_path / "whole")
+    train(small(*options, "steps=3", "pivot=origin"), str(dataset), tmp_path / "old")
     rewrite_as_old(tmp_path / "old")
     train(small(*options, "steps=6"), str(dataset), tmp_path / "old", resume=True)
+    assert checkpoint.load(tmp_path / "old/last.safetensors").provenance.config.pivot == "origin"
     whole, resumed = (load_file(tmp_path / name / "last.safetensors") for name in ("whole", "old"))
     assert all(torch.equal(whole[key], resumed[key]) for key in whole)
     lines = [json.loads(line) for line in (tmp_path / "old/metrics.jsonl").read_text().splitlines()]

@@ -23,7 +23,7 @@ from ..conftest import HEIGHT_PX, WIDTH_PX, K, starts_of
 
 
 class Oracle(torch.nn.Module):
-    """Moves every hypothesis a share of the way to the nearest truth."""
+    """Moves every hypothesis, a pose of the centre, a share of the way to the nearest truth."""
 
     def __init__(self, truths, share):
         super().__init__()
@@ -39,6 +39,11 @@ class Oracle(torch.nn.Module):
         return PoseUpdate(*(torch.from_numpy(np.stack(x)).float() for x in zip(*updates, strict=True)))
 
 
+def at_center(poses, mesh):
+    """Poses of the object's centre, as a network has them."""
+    return [se3.with_origin_at(T, mesh.center_m) for T in poses]
+
+
 def requests_of(poses):
     return [Request(obj_id=1, T_cam_obj=T) for T in poses]
 
@@ -47,7 +52,7 @@ def requests_of(poses):
 def test_refinement_iterates_to_the_truth_and_stops(mesh, trained, frame, share, most):
     image, truths = frame
     with Refiner.load(trained, {1: mesh}, iterations=10) as refiner:
-        refiner._network = Oracle(truths, share)
+        refiner._network = Oracle(at_center(truths, mesh), share)
         results = refiner.refine_batch(Frame(image=image, K=K), requests_of(starts_of(truths, mesh)))
     assert [result.status for result in results] == [Status.CONVERGED] * 2
     assert all(result.failure is None and result.iterations <= most for result in results)
@@ -59,7 +64,7 @@ def test_refinement_iterates_to_the_truth_and_stops(mesh, trained, frame, share,
 def test_iterations_that_are_used_up_are_said(mesh, trained, frame):
     image, truths = frame
     with Refiner.load(trained, {1: mesh}, iterations=1) as refiner:
-        refiner._network = Oracle(truths, 0.5)
+        refiner._network = Oracle(at_center(truths, mesh), 0.5)
         result = refiner.refine(image, K, starts_of(truths, mesh)[0], 1)
     assert (result.status, result.iterations) == (Status.STOPPED, 1)
 
@@ -96,7 +101,7 @@ def test_a_pose_that_cannot_be_seen_fails_with_the_reason(mesh, trained, frame, 
     starts = starts_of(truths, mesh)
     starts[0] = se3.make_T(np.eye(3), np.array(lost_t, float))
     with Refiner.load(trained, {1: mesh}) as refiner:
-        refiner._network = Oracle(truths, 1.0)
+        refiner._network = Oracle(at_center(truths, mesh), 1.0)
         lost, found = refiner.refine_batch(Frame(image=image, K=K), requests_of(starts))
     assert (lost.failed, lost.confidence, lost.iterations) == (True, 0.0, 0)
     assert re.search(why, lost.failure)
@@ -123,7 +128,7 @@ def test_a_pose_that_is_driven_out_of_the_image_fails(mesh, trained, frame):
     away = [se3.make_T(T[:3, :3], np.array([9.0, 0, 1])) for T in truths]
     starts = starts_of(truths, mesh)
     with Refiner.load(trained, {1: mesh}, iterations=1) as refiner:
-        refiner._network = Oracle(away, 1.0)
+        refiner._network = Oracle(at_center(away, mesh), 1.0)
         results = refiner.refine_batch(Frame(image=image, K=K), requests_of(starts))
     for result, start in zip(results, starts, strict=True):
         assert "after 1 updates it lies at" in result.failure
@@ -207,7 +212,7 @@ def test_confidence_is_the_networks_where_it_has_one_and_else_of_the_gradients(m
         assert ((at_start > 0) & (at_truth <= 1)).all()
         with pytest.raises(CheckpointError, match="has no confidence output; choose --scorer gradient"):
             refiner.confidences(Frame(image=image, K=K), requests_of(truths), "learned")
-        refiner._network, refiner.scorer = Sure(truths), "learned"
+        refiner._network, refiner.scorer = Sure(at_center(truths, mesh)), "learned"
         result = refiner.refine(image, K, starts[0], 1)
     assert result.confidence == pytest.approx(1 / (1 + np.exp(-2)), abs=0.01)
 
@@ -218,7 +223,7 @@ def test_a_pool_is_ranked_and_its_best_is_returned(mesh, trained, frame, monkeyp
     image, truths = frame
     starts, seen = starts_of(truths, mesh), []
     with Refiner.load(trained, {1: mesh}) as refiner:
-        refiner._network = Oracle(truths, 0.0)
+        refiner._network = Oracle(at_center(truths, mesh), 0.0)
         inner = refiner.refine_batch
         monkeypatch.setattr(
             refiner, "refine_batch", lambda frame, requests: seen.append(len(requests)) or inner(frame, requests)

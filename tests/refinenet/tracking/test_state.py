@@ -5,6 +5,7 @@ import pytest
 from posecore import se3
 from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
+from posecore.mesh import Mesh
 from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
 from refinenet.refiner import Frame, Refinement, Status
 from refinenet.tracking.state import (
@@ -23,6 +24,7 @@ from ..conftest import K
 CONFIG = TrackingConfig(tracking_threshold=0.6, accept_threshold=0.4, patience=3, depth_step=0.0)
 T, U, L = TrackState.TRACKING, TrackState.UNCERTAIN, TrackState.LOST
 EMPTY = Frame(image=np.zeros((480, 640, 3), np.uint8), K=K)
+SMALL = {1: Mesh(vertices_m=np.eye(3) * 0.05 - 0.025, faces=np.array([[0, 1, 2]]), normals=np.eye(3))}
 
 
 def pose(seed, z=0.7):
@@ -124,7 +126,8 @@ class Script:
 
     name, needs_depth, score_kind, corrects_depth, settings = "script", False, "learned", False, {}
 
-    def __init__(self, confidences, moved=lambda T: T):
+    def __init__(self, confidences, moved=lambda T: T, meshes=SMALL):
+        self.meshes = meshes
         self.confidences, self.moved, self.asked = list(confidences), moved, []
 
     def refine_batch(self, frame, requests):
@@ -187,7 +190,7 @@ def test_a_symmetric_object_keeps_its_spin_through_a_track():
 
 
 def test_each_depth_is_asked_for():
-    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03))
+    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03), center_m=np.zeros(3))
     assert len(track.hypotheses(0, [pose(8)])) == 1  # what is offered is taken as it is
     track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
     depths = [request.T_cam_obj[2, 3] / pose(8)[2, 3] for request in track.hypotheses(1, [])]
@@ -197,7 +200,7 @@ def test_each_depth_is_asked_for():
 def test_a_depth_is_left_only_for_one_that_is_clearly_better():
     nearer = pose(8, z=0.68)
     for confidence, z in ((0.61, 0.7), (0.63, 0.68)):
-        track = ObjectTrack(obj_id=1, config=TrackingConfig())
+        track = ObjectTrack(obj_id=1, config=TrackingConfig(), center_m=np.zeros(3))
         track.update(0, [Refinement(T_cam_obj=pose(8), status=Status.CONVERGED, iterations=1, confidence=0.9)])
         track.hypotheses(1, [])
         results = [(pose(8), 0.6), (nearer, confidence), (pose(8, z=0.72), 0.5)]
@@ -208,11 +211,34 @@ def test_a_depth_is_left_only_for_one_that_is_clearly_better():
 
 
 def test_a_pose_whose_refinement_failed_is_believed_under_no_threshold():
-    track = ObjectTrack(
-        obj_id=1, config=TrackingConfig(tracking_threshold=0.0, accept_threshold=0.0, patience=2, depth_step=0.0)
-    )
+    config = TrackingConfig(tracking_threshold=0.0, accept_threshold=0.0, patience=2, depth_step=0.0)
+    track = ObjectTrack(obj_id=1, config=config, center_m=np.zeros(3))
     for frame, (status, state) in enumerate([(Status.STOPPED, T), (Status.FAILED, U), (Status.FAILED, L)]):
         track.hypotheses(frame, [pose(0)])
         found = Refinement(T_cam_obj=pose(0), status=status, iterations=1, confidence=0.0, failure="gone")
         told = track.update(frame, [found])
         assert (told.state, told.T_cam_obj is None) == (state, status is Status.FAILED)
+
+
+def test_depths_and_motion_are_about_the_centre():
+    """A mesh with its origin 2 m off: the centre stays on its ray, and goes on straight."""
+    shift_m = np.array([2.0, -1.0, 0.5])
+    far = {1: SMALL[1].with_origin_at(-shift_m)}
+    center_m = far[1].center_m
+    track = ObjectTrack(obj_id=1, config=TrackingConfig(depth_step=0.03), center_m=center_m)
+    T = se3.with_origin_at(pose(8), -shift_m)
+    track.hypotheses(0, [T])
+    track.update(0, [Refinement(T_cam_obj=T, status=Status.CONVERGED, iterations=1, confidence=0.9)])
+    tried = np.stack([far[1].center_cam_m(request.T_cam_obj) for request in track.hypotheses(1, [])])
+    at_m = far[1].center_cam_m(T)
+    np.testing.assert_allclose(tried, at_m * np.array([[1.0], [0.97], [1.03]]), atol=1e-12)
+
+    turn, step_m = se3.rotation_from_rotvec(np.array([0.1, 0.2, -0.1])), np.array([0.01, 0.0, 0.002])
+
+    def moved(T_cam_obj):
+        return se3.with_origin_at(se3.apply_update(se3.with_origin_at(T_cam_obj, center_m), turn, step_m), -center_m)
+
+    refiner = Script([0.9] * 4, moved=moved, meshes=far)
+    tracker = Tracker(refiner, [1], CONFIG, motion_model=True)
+    found = [tracker.step(i, EMPTY, {1: [T]})[0].T_cam_obj for i in range(3)]
+    np.testing.assert_allclose(refiner.asked[2][0], moved(found[1]), atol=1e-9)

@@ -467,3 +467,14 @@ def test_from_the_command_line(images, tmp_path):
     assert failed.exit_code == 1
     assert "no such folder" in failed.output
     assert not (tmp_path / "x").exists()
+
+
+def test_a_rough_rotation_becomes_exact_about_the_centre(tug):
+    """LM-O's annotations are scaled by up to 1.0048: about an origin 2 m off, that would move the object by 10 mm."""
+    T = se3.make_T(1.0048 * se3.random_rotation(np.random.default_rng(0)), np.array([0.1, 0.0, 0.8]))
+    far = tug.with_origin_at(np.array([-2.0, 0.0, 0.0]))
+    T_far = se3.with_origin_at(T, np.array([-2.0, 0.0, 0.0]))
+    made, made_far = cut_plan.rigid(T, tug), cut_plan.rigid(T_far, far)
+    assert se3.is_rotation(made_far[:3, :3], 1e-9)
+    np.testing.assert_allclose(far.center_cam_m(made_far), tug.center_cam_m(T), atol=1e-12)
+    np.testing.assert_allclose(se3.apply(made_far, far.vertices_m), se3.apply(made, tug.vertices_m), atol=1e-12)

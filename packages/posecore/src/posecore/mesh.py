@@ -59,12 +59,25 @@ class Mesh:
 
     @cached_property
     def center_m(self) -> Float[np.ndarray, "3"]:
-        """Centre of the axis-aligned bounding box in object coordinates, metres."""
-        return np.asarray((self.vertices_m.min(axis=0) + self.vertices_m.max(axis=0)) / 2)
+        """The object's centre: middle of the axis-aligned bounding box over vertices that faces use, metres.
+
+        Pivot of rotations, end of viewing rays and distances; the origin may lie anywhere.
+        """
+        used = np.zeros(len(self.vertices_m), bool)
+        used[self.faces] = True
+        points = self.vertices_m[used] if used.any() else self.vertices_m
+        return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
     def center_cam_m(self, T_cam_obj: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 3"]:
-        """Centre of the bounding box in camera coordinates at each pose, metres."""
+        """The centre in camera coordinates at each pose, metres."""
         return np.asarray(T_cam_obj[..., :3, :3] @ self.center_m + T_cam_obj[..., :3, 3])
+
+    def with_origin_at(self, point_m: Float[np.ndarray, "3"]) -> "Mesh":
+        """The mesh in the frame with the same axes and its origin at a point; `se3.with_origin_at` converts poses.
+
+        It is not the file's mesh any more, so it has no hash.
+        """
+        return replace(self, vertices_m=self.vertices_m - point_m, sha256="")
 
     @cached_property
     def colours(self) -> UInt8[np.ndarray, "v 3"]:

@@ -1,7 +1,8 @@
 """Rigid transforms as 4 x 4 matrices.
 
 `T_a_b` maps points of frame b into frame a: `p_a = T_a_b @ p_b`. Lengths are metres, angles radians.
-A pose update (dR, dt) is in camera axes about the object's origin: R' = dR R, t' = t + dt.
+A pose update (dR, dt) is in camera axes about the pose's origin: R' = dR R, t' = t + dt. Updates, rays and distances
+are meant about an object's centre: `with_origin_at` gives the pose of the frame whose origin is there.
 """
 
 import numpy as np
@@ -28,6 +29,21 @@ def inverse(T: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
 def apply(T: Float[np.ndarray, "*b 4 4"], points: Float[np.ndarray, "*c n 3"]) -> Float[np.ndarray, "*d n 3"]:
     """Transform points (metres); batch axes of both broadcast."""
     return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
+
+
+def with_origin_at(
+    T_cam_obj: Float[np.ndarray, "*b 4 4"], point_m: Float[np.ndarray, "*c 3"]
+) -> Float[np.ndarray, "*b 4 4"]:
+    """Poses of the frame with the object's axes and its origin at a point.
+
+    The way back is `with_origin_at(T, -point_m)`. A pose's result does not depend on the others in the batch.
+
+    Args:
+        T_cam_obj: Poses, metres.
+        point_m: In the object's frame, metres: one point, or a point of each pose.
+    """
+    R = T_cam_obj[..., :3, :3]
+    return make_T(R, (R * np.asarray(point_m, np.float64)[..., None, :]).sum(axis=-1) + T_cam_obj[..., :3, 3])
 
 
 def rotation_angle_rad(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b"]:
@@ -91,7 +107,7 @@ def nearest_rotation(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 
 def apply_update(
     T_cam_obj: Float[np.ndarray, "*b 4 4"], dR: Float[np.ndarray, "*b 3 3"], dt_m: Float[np.ndarray, "*b 3"]
 ) -> Float[np.ndarray, "*b 4 4"]:
-    """Update a pose in camera axes about the object's origin: R' = dR R, t' = t + dt."""
+    """Update a pose in camera axes about its origin: R' = dR R, t' = t + dt."""
     return make_T(dR @ T_cam_obj[..., :3, :3], T_cam_obj[..., :3, 3] + dt_m)
 
 
@@ -114,7 +130,7 @@ def perturb(
 def stretched_along_ray(
     T_cam_obj: Float[np.ndarray, "4 4"], moved: Float[np.ndarray, "4 4"], factor: float
 ) -> Float[np.ndarray, "4 4"]:
-    """`moved` with its translation along the ray from the camera to the object's origin multiplied by a factor."""
+    """`moved` with its translation along the ray from the camera to `T_cam_obj`'s origin multiplied by a factor."""
     ray = T_cam_obj[:3, 3] / np.linalg.norm(T_cam_obj[:3, 3])
     along_m = (moved[:3, 3] - T_cam_obj[:3, 3]) @ ray
     return make_T(moved[:3, :3], moved[:3, 3] + (factor - 1) * along_m * ray)

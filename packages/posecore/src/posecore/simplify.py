@@ -26,17 +26,19 @@ def simplified(mesh: Mesh, max_faces: int) -> Mesh:
     if len(mesh.faces) <= max_faces or mesh.texture_rgb is not None:
         return mesh
     # Vertices at the same position are merged: unconnected triangles would be dropped as a whole.
-    _, first, merged = np.unique(mesh.vertices_m.round(9), axis=0, return_index=True, return_inverse=True)
+    about_center_m = mesh.vertices_m - mesh.center_m  # float32 has no digits to spare for an origin metres off
+    _, first, merged = np.unique(about_center_m.round(9), axis=0, return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))  # the order of the file, which the result depends on
     vertices_m, faces = fast_simplification.simplify(
-        mesh.vertices_m[np.sort(first)].astype(np.float32),
+        about_center_m[np.sort(first)].astype(np.float32),
         rank[merged.reshape(-1)][mesh.faces].astype(np.int32),
         target_count=max_faces,
     )
-    nearest = cKDTree(mesh.vertices_m).query(vertices_m)[1]
+    vertices_m = vertices_m.astype(np.float64)
+    nearest = cKDTree(about_center_m).query(vertices_m)[1]
     return replace(
         mesh,
-        vertices_m=vertices_m.astype(np.float64),
+        vertices_m=vertices_m + mesh.center_m,
         faces=faces.astype(np.int32),
         normals=mesh.normals[nearest],
         vertex_rgb=None if mesh.vertex_rgb is None else mesh.vertex_rgb[nearest],

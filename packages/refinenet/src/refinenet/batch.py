@@ -1,4 +1,4 @@
-"""Tensors that flow from the data to the network and the loss."""
+"""Tensors that flow from the data to the network and the loss. Poses are those of the objects' pivots."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,7 +14,7 @@ class NetworkInput(NamedTuple):
     Attributes:
         scene_rgb: (b, 3, p, p) patch of the image.
         hypothesis_rgb: (b, 3, p, p) render of the object alone on black, same window.
-        T_cam_obj: (b, 4, 4) hypothesis, metres.
+        T_cam_obj: (b, 4, 4) hypothesis, metres, its origin at the pivot.
         K_crop: (b, 3, 3) intrinsics of the patch.
         hypothesis_depth_m: (b, p, p) camera z of the render, 0 on the background; None where it is not an input.
     """

@@ -126,7 +126,7 @@ def render_obstacle(T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh) -> str | No
         return "its pose is not finite"
     if not se3.is_rotation(T_cam_obj[:3, :3], ROTATION_TOLERANCE):
         return "its upper 3 x 3 block is not a rotation: it is scaled, mirrored or sheared"
-    z_m = float(T_cam_obj[2, :3] @ mesh.center_m + T_cam_obj[2, 3])
+    z_m = float(mesh.center_cam_m(T_cam_obj)[2])
     if z_m < NEAREST_DIAMETERS * mesh.diameter_m:
         unit = "; were metres taken for millimetres?" if 0 < z_m < SUSPICIOUS_M else ""
         return f"at z = {z_m:.3g} m it is behind the camera or reaches it{unit}"
@@ -176,8 +176,15 @@ class PoseRefiner(Protocol):
         """Settings for the result file's sidecar: JSON values, units in the keys."""
         ...
 
+    @property
+    def meshes(self) -> Mapping[int, Mesh]:
+        """The objects' meshes, as given to the constructor."""
+        ...
+
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses in an image: a result for each request, in the same order.
+
+        Poses are those of the meshes' origins; the result does not depend on where an origin lies.
 
         A pose that cannot be refined is a result with status `FAILED`, not an error.
         """

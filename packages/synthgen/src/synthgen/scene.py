@@ -6,12 +6,13 @@ rendered by two engines and compared.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
+from posecore import se3
 from posecore.camera import Camera
 from posecore.errors import ConfigError
 
@@ -132,6 +133,18 @@ class SceneObject:
             raise ConfigError("object.T_cam_obj: got a scaled, mirrored or sheared matrix, expected a rigid transform")
         T.setflags(write=False)
         object.__setattr__(self, "T_cam_obj", T)
+
+
+def with_origins_at(
+    objects: Sequence[SceneObject], points_m: Mapping[int, Float[np.ndarray, "3"]]
+) -> tuple[SceneObject, ...]:
+    """Objects in frames with their own axes and the origin at a point of each mesh key; others stay."""
+    return tuple(
+        replace(item, T_cam_obj=se3.with_origin_at(item.T_cam_obj, points_m[item.mesh_key]))
+        if item.mesh_key in points_m
+        else item
+        for item in objects
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

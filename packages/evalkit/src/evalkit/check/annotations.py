@@ -32,21 +32,32 @@ class Scenes:
     """Usable annotations of a split.
 
     Attributes:
+        centers_m: centre of each object, object frame, metres.
         images: images with a camera, in order.
         instances: usable annotations of each image with ground truth.
         instance_counts: number of poses of each object in each image with ground truth.
         matrices: valid camera matrices by image.
     """
 
+    centers_m: Mapping[int, Float[np.ndarray, "3"]] = field(default_factory=dict)
     images: list[Image] = field(default_factory=list)
     instances: dict[Image, list[GroundTruth]] = field(default_factory=dict)
     instance_counts: dict[Image, Counter[int]] = field(default_factory=dict)
     matrices: dict[Image, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
+    def of_center(self, gt: GroundTruth) -> Float[np.ndarray, "4 4"]:
+        """Pose of the object's centre; of the origin of an unknown object."""
+        return se3.with_origin_at(gt.T_cam_obj, self.centers_m.get(gt.obj_id, np.zeros(3)))
 
-def check_scenes(dataset: BopDataset, infos: Mapping[int, ModelInfo], findings: Findings) -> Scenes:
+
+def check_scenes(
+    dataset: BopDataset,
+    infos: Mapping[int, ModelInfo],
+    centers_m: Mapping[int, Float[np.ndarray, "3"]],
+    findings: Findings,
+) -> Scenes:
     """Check every annotation of every scene."""
-    scenes = Scenes()
+    scenes = Scenes(centers_m=centers_m)
     if not dataset.is_sharded:
         for folder, sensors in scenes_of(dataset.split_path).items():
             if not sensors:
@@ -60,6 +71,9 @@ def check_scenes(dataset: BopDataset, infos: Mapping[int, ModelInfo], findings: 
         for im_id, (entry, where) in entries["gt"].items():
             image = (scene_id, im_id)
             instances = _check_instances(entry, where, entries["gt_info"].get(im_id), infos, findings)
+            for gt in instances:
+                if gt.has_pose:
+                    _check_pose(gt, scenes.of_center(gt)[2, 3] / MM, f"{where}, entry {gt.gt_index}", findings)
             scenes.instances[image] = instances
             scenes.instance_counts[image] = Counter(gt.obj_id for gt in instances if gt.has_pose)
         findings.cover("scenes")
@@ -185,8 +199,6 @@ def _check_instances(
             findings.add(
                 "error", "unknown-object", entry_where, f"'obj_id' is {gt.obj_id}, models_info.json has {listed}"
             )
-        if gt.has_pose:
-            _check_pose(gt, entry_where, findings)
     _check_repeated(instances, where, findings)
     return instances
 
@@ -198,10 +210,11 @@ def _visible_fraction(entry: Any) -> float | None:
         return None
 
 
-def _check_pose(gt: GroundTruth, where: str, findings: Findings) -> None:
-    R, z_mm = gt.T_cam_obj[:3, :3], gt.T_cam_obj[2, 3] / MM
-    if z_mm <= 0:
-        findings.add("error", "behind-camera", where, f"t_z is {z_mm:g} mm, expected a pose in front of the camera")
+def _check_pose(gt: GroundTruth, center_z_mm: float, where: str, findings: Findings) -> None:
+    R = gt.T_cam_obj[:3, :3]
+    if center_z_mm <= 0:
+        message = f"the object's centre is at z = {center_z_mm:g} mm, expected a pose in front of the camera"
+        findings.add("error", "behind-camera", where, message)
     residual = float(np.abs(R @ R.T - np.eye(3)).max())
     if residual > ROUGH_ROTATION:
         scale = float(np.linalg.det(R)) ** (1 / 3)
@@ -248,7 +261,10 @@ def _check_info(entry: Any, where: str, findings: Findings) -> None:
 
 
 def _check_units(dataset: BopDataset, scenes: Scenes, findings: Findings) -> None:
-    z_mm = [gt.T_cam_obj[2, 3] / MM for instances in scenes.instances.values() for gt in instances if gt.has_pose]
-    if z_mm and float(np.median(np.abs(z_mm))) < SUSPICIOUS_DISTANCE_MM:
-        message = f"the median t_z of {len(z_mm)} ground-truth poses is {float(np.median(z_mm)):.4g} mm"
+    poses = [gt.T_cam_obj for instances in scenes.instances.values() for gt in instances if gt.has_pose]
+    if not poses:
+        return
+    median_mm = float(np.median(np.linalg.norm(np.array(poses)[:, :3, 3], axis=1))) / MM
+    if median_mm < SUSPICIOUS_DISTANCE_MM:
+        message = f"the median length of t of {len(poses)} ground-truth poses is {median_mm:.4g} mm"
         findings.add("error", "units", str(dataset.split_path), message, "metres? BOP files hold millimetres")

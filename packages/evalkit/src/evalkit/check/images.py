@@ -18,7 +18,7 @@ Size = tuple[int, int]
 MASK_KINDS: tuple[MaskKind, ...] = ("mask", "mask_visib")
 CLEARLY_VISIBLE = 0.3
 DEPTH_RATIO = (0.5, 2.0)
-"""Median over an image of depth / t_z at the objects: outside this range the depth scale is wrong."""
+"""Median over an image of depth / z at the objects' centres: outside this range the depth scale is wrong."""
 
 
 def check_images(
@@ -96,9 +96,9 @@ def _check_on_image(
     visible = [gt for gt in visible if gt.obj_id in infos]
     if not visible:
         return
-    T_cam_obj = np.stack([gt.T_cam_obj for gt in visible])
+    T_cam_center = np.stack([scenes.of_center(gt) for gt in visible])
     reach_m = np.array([infos[gt.obj_id].diameter_m for gt in visible])
-    for gt, off_px in zip(visible, off_image_px(T_cam_obj, scenes.matrices[image], size, reach_m), strict=True):
+    for gt, off_px in zip(visible, off_image_px(T_cam_center, scenes.matrices[image], size, reach_m), strict=True):
         if off_px > 0:
             where = f"{dataset.annotation(image[0], 'gt')}, image {image[1]}, entry {gt.gt_index}"
             message = f"object {gt.obj_id} lies at least {off_px:.0f} px outside the image of {_words(size)}"
@@ -106,19 +106,19 @@ def _check_on_image(
 
 
 def off_image_px(
-    T_cam_obj: Float[np.ndarray, "n 4 4"], K: Float[np.ndarray, "3 3"], size: Size, reach_m: Float[np.ndarray, " n"]
+    T_cam_center: Float[np.ndarray, "n 4 4"], K: Float[np.ndarray, "3 3"], size: Size, reach_m: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, " n"]:
     """Distance of objects from the image in pixels, 0 where they may touch it.
 
     Args:
-        T_cam_obj: poses, metres; one close to the camera or behind it counts as touching.
+        T_cam_center: poses of the objects' centres, metres; one close to the camera or behind it counts as touching.
         K: camera matrix.
         size: width and height of the image, pixels.
-        reach_m: largest distance of the object's points from its origin.
+        reach_m: largest distance of the object's points from its centre.
     """
-    z_m = T_cam_obj[:, 2, 3]
+    z_m = T_cam_center[:, 2, 3]
     is_far = z_m > 2 * reach_m
-    uv = project(K, np.where(is_far[:, None], T_cam_obj[:, :3, 3], [0.0, 0.0, 1.0]))
+    uv = project(K, np.where(is_far[:, None], T_cam_center[:, :3, 3], [0.0, 0.0, 1.0]))
     outside = np.maximum(-uv, uv - np.array(size)).max(axis=1)
     reach_px = max(K[0, 0], K[1, 1]) * reach_m / np.where(is_far, z_m - reach_m, 1.0) * 2
     return np.where(is_far, np.maximum(outside - reach_px, 0.0), 0.0)
@@ -151,7 +151,7 @@ def _check_depth(
     if not (depth_m > 0).any():
         findings.add("warning", "depth", str(file), "is 0 everywhere")
     elif image in scenes.matrices:
-        _check_depth_scale(str(file), depth_m, scale, instances, scenes.matrices[image], findings)
+        _check_depth_scale(str(file), depth_m, scale, instances, scenes, scenes.matrices[image], findings)
     return True
 
 
@@ -160,20 +160,24 @@ def _check_depth_scale(
     depth_m: Float[np.ndarray, "h w"],
     scale: float,
     instances: list[GroundTruth],
+    scenes: Scenes,
     K: Float[np.ndarray, "3 3"],
     findings: Findings,
 ) -> None:
     ratios = []
     for gt in instances:
-        z_m = float(gt.T_cam_obj[2, 3])
+        center_m = scenes.of_center(gt)[:3, 3]
+        z_m = float(center_m[2])
         if z_m <= 0 or (gt.visib_fract is not None and gt.visib_fract < CLEARLY_VISIBLE):
             continue
-        column, row = (int(value) for value in np.floor(project(K, gt.T_cam_obj[None, :3, 3])[0]))
+        column, row = (int(value) for value in np.floor(project(K, center_m[None])[0]))
         if 0 <= row < depth_m.shape[0] and 0 <= column < depth_m.shape[1] and depth_m[row, column] > 0:
             ratios.append(depth_m[row, column] / z_m)
     if ratios and not DEPTH_RATIO[0] < float(np.median(ratios)) < DEPTH_RATIO[1]:
         median = float(np.median(ratios))
-        message = f"depth is {median:.4g} times the objects' t_z, expected about 1 ('depth_scale' is {scale:g})"
+        message = (
+            f"depth is {median:.4g} times that of the objects' centres, expected about 1 ('depth_scale' is {scale:g})"
+        )
         findings.add("error", "depth-scale", where, message, f"is the scale {scale / median:.3g} mm?")
 
 

@@ -1,6 +1,6 @@
 """Models against `models_info.json`: loading, diameters, boxes and symmetries."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from posecore import se3
 from posecore.bop import BopDataset, ModelInfo
 from posecore.bop.jsonfile import integer_keys, numbers, read_json
 from posecore.bop.models_info import MM, load_model_info
-from posecore.errors import DatasetError, MeshError
+from posecore.errors import DatasetError, MeshError, PoseError
 from posecore.mesh import Mesh, load_mesh
 from posecore.symmetry import rotations_about_axis
 from scipy.spatial import cKDTree
@@ -49,6 +49,17 @@ def check_models(dataset: BopDataset, findings: Findings) -> dict[int, ModelInfo
     for folder in folders:
         _check_folder(folder, infos, findings, has_own_info=folder == chosen.parent)
     return infos
+
+
+def centers_m(dataset: BopDataset, obj_ids: Iterable[int]) -> dict[int, Float[np.ndarray, "3"]]:
+    """Centre of each object, object frame, metres; its origin where the model is unusable, which is reported."""
+    centers = {}
+    for obj_id in obj_ids:
+        try:
+            centers[obj_id] = dataset.center_m(obj_id)
+        except PoseError:
+            centers[obj_id] = np.zeros(3)
+    return centers
 
 
 def _load_infos(file: Path, findings: Findings) -> dict[int, ModelInfo]:

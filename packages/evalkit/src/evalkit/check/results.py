@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
+from posecore import se3
 from posecore.bop import BopDataset, ResultTable, read_sidecar
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import LineFault, parse_results
@@ -15,6 +16,7 @@ from posecore.errors import PoseError, ResultFileError
 from evalkit.check.annotations import ROUGH_ROTATION
 from evalkit.check.findings import Findings
 from evalkit.check.images import off_image_px
+from evalkit.check.models import centers_m
 
 TIME_TOLERANCE_S = 1e-3
 """Largest difference between an image's times that bop_toolkit accepts."""
@@ -159,9 +161,12 @@ def _check_poses(
     path: Path, table: ResultTable, is_valid: Bool[np.ndarray, " n"], dataset: BopDataset, findings: Findings
 ) -> None:
     """Poses behind the camera or outside the image."""
-    behind = is_valid & (table.T_cam_obj[:, 2, 3] <= 0)
+    centers = centers_m(dataset, dataset.models_info)
+    points_m = np.array([centers.get(obj_id, np.zeros(3)) for obj_id in table.obj_id.tolist()]).reshape(-1, 3)
+    T_cam_center = se3.with_origin_at(table.T_cam_obj, points_m)
+    behind = is_valid & (T_cam_center[:, 2, 3] <= 0)
     for index in np.flatnonzero(behind).tolist():
-        message = f"t_z is {table.T_cam_obj[index, 2, 3] / MM:.6g} mm, the object is behind the camera"
+        message = f"the object's centre is at z = {T_cam_center[index, 2, 3] / MM:.6g} mm, behind the camera"
         findings.add("warning", "behind-camera", f"{path}:{int(table.line[index])}", message)
     indices = np.flatnonzero(is_valid & ~behind)
     if not len(indices):
@@ -179,7 +184,7 @@ def _check_poses(
         except PoseError:  # reported with the dataset
             continue
         reach_m = np.array([diameters[obj_id] for obj_id in table.obj_id[here].tolist()])
-        off_px[here] = off_image_px(table.T_cam_obj[here], camera.K, (camera.width_px, camera.height_px), reach_m)
+        off_px[here] = off_image_px(T_cam_center[here], camera.K, (camera.width_px, camera.height_px), reach_m)
     for index in np.flatnonzero(off_px > 0).tolist():
         message = f"object {int(table.obj_id[index])} lies at least {off_px[index]:.0f} px outside its image"
         findings.add("warning", "off-image", f"{path}:{int(table.line[index])}", message)

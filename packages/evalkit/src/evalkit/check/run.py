@@ -9,7 +9,7 @@ from posecore.errors import PoseError
 from evalkit.check.annotations import check_scenes
 from evalkit.check.findings import Findings
 from evalkit.check.images import check_images
-from evalkit.check.models import check_models
+from evalkit.check.models import centers_m, check_models
 from evalkit.check.results import check_results
 from evalkit.check.self_test import check_ground_truth
 from evalkit.check.targets import check_targets
@@ -62,7 +62,7 @@ def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, on_sta
     on_stage("models")
     infos = check_models(dataset, findings)
     on_stage("annotations")
-    scenes = check_scenes(dataset, infos, findings)
+    scenes = check_scenes(dataset, infos, centers_m(dataset, infos), findings)
     on_stage("images")
     chosen = check_images(dataset, scenes, infos, samples, findings)
     on_stage("targets")

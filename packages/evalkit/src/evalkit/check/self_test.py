@@ -18,7 +18,7 @@ def check_ground_truth(dataset: BopDataset, scenes: Scenes, images: list[Image],
     pairs = []
     for image in images:
         for gt in scenes.instances.get(image, []):
-            if gt.has_pose and gt.T_cam_obj[2, 3] > 0:
+            if gt.has_pose and scenes.of_center(gt)[2, 3] > 0:
                 estimate = Estimate(scene_id=image[0], im_id=image[1], obj_id=gt.obj_id, T_cam_obj=gt.T_cam_obj.copy())
                 pairs.append(MatchedPose(scene_id=image[0], im_id=image[1], gt=gt, estimate=estimate))
     if not pairs:

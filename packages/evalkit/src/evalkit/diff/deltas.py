@@ -220,6 +220,6 @@ def _change(
 
 def _causes(side: Side, sides: Sides, limit_diameters: float) -> np.ndarray:
     assert side.scored is not None and sides.evaluator is not None
-    infos = sides.evaluator.dataset.models_info
-    chosen = causes(side.table, side.scored.T_est, side.scored.T_gt, infos, limit_diameters=limit_diameters)
+    infos, scored = sides.evaluator.dataset.models_info, side.scored
+    chosen = causes(side.table, scored.T_est, scored.T_gt, scored.center_m, infos, limit_diameters=limit_diameters)
     return np.asarray(chosen.astype(str).to_numpy())

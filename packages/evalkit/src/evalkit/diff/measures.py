@@ -72,7 +72,7 @@ MEASURES: Mapping[str, Measure] = {
     "proj": _error("px", "proj_px", "average projected distance"),
     "re": _error("deg", "re_deg", "rotation error"),
     "re_sym": _error("deg", "re_sym_deg", "rotation error at the best symmetry"),
-    "te": _error("mm", "te_mm", "distance of the origins"),
+    "te": _error("mm", "te_mm", "distance of the centres"),
     "tx": _error("mm", "tx_mm", "error along camera x"),
     "ty": _error("mm", "ty_mm", "error along camera y"),
     "tz": _error("mm", "tz_mm", "error along camera z"),

@@ -27,6 +27,7 @@ class Scored:
         table: see `evalkit.error_table`.
         T_est: (n, 4, 4) estimates `T_cam_obj`, metres, NaN where missing.
         T_gt: (n, 4, 4) ground-truth poses.
+        center_m: (n, 3) centre of each pose's object, object frame, metres.
         ignored: number of lines without an expected pose.
         precision: BOP24's average precision of all lines, see `scores.bop24_precision`; empty for perturbed poses.
     """
@@ -35,6 +36,7 @@ class Scored:
     table: pd.DataFrame
     T_est: Float[np.ndarray, "n 4 4"]
     T_gt: Float[np.ndarray, "n 4 4"]
+    center_m: Float[np.ndarray, "n 3"]
     ignored: int
     precision: dict[str, Any] = field(default_factory=dict)
 
@@ -71,6 +73,7 @@ def score_file(
         table=table,
         T_est=_stacked([NO_POSE if pair.estimate is None else pair.estimate.T_cam_obj for pair in pairing.pairs]),
         T_gt=_stacked([pair.gt.T_cam_obj for pair in pairing.pairs]),
+        center_m=np.array([evaluator.dataset.center_m(pair.gt.obj_id) for pair in pairing.pairs]).reshape(-1, 3),
         ignored=pairing.ignored,
         precision=precision,
     )

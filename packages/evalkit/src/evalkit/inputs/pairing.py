@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
+from posecore import se3
 from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.bop.perturbation import Level, instances_of
 from posecore.errors import ResultFileError
@@ -53,7 +55,7 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
         matched: list[tuple[GroundTruth, Estimate | None]] = []
         for estimate in best[: len(instances)]:
             free = [gt for gt in instances if all(gt is not other for other, _ in matched)]
-            matched.append((min(free, key=lambda gt: _distance_m(estimate, gt)), estimate))
+            matched.append((_nearest(dataset, estimate, free), estimate))
         unmatched = [gt for gt in instances if all(gt is not other for other, _ in matched)]
         matched += [(gt, None) for gt in unmatched[: max(0, min(target.inst_count, len(instances)) - len(matched))]]
         pairs += [
@@ -64,8 +66,24 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
     return Pairing(pairs=pairs, ignored=len(result.estimates) - used)
 
 
-def _distance_m(estimate: Estimate, gt: GroundTruth) -> float:
-    return float(np.linalg.norm(estimate.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3]))
+def _nearest(dataset: BopDataset, estimate: Estimate, instances: Sequence[GroundTruth]) -> GroundTruth:
+    """The instance whose centre is nearest; of equal ones the first."""
+    if len(instances) == 1:
+        return instances[0]
+    distances_m = distances_of_centers_m(dataset, [estimate], instances)
+    return instances[int(distances_m[0].argmin())]
+
+
+def distances_of_centers_m(
+    dataset: BopDataset, estimates: Sequence[Estimate], instances: Sequence[GroundTruth]
+) -> Float[np.ndarray, "e i"]:
+    """Distances between the object's centre at estimates and at ground-truth poses of one object, metres."""
+    center_m = dataset.center_m(instances[0].obj_id)
+    est, gt = (
+        se3.with_origin_at(np.array([item.T_cam_obj for item in items], np.float64).reshape(-1, 4, 4), center_m)
+        for items in (estimates, instances)
+    )
+    return np.asarray(np.linalg.norm(est[:, None, :3, 3] - gt[:, :3, 3], axis=-1))
 
 
 def _by_key(estimates: Iterable[Estimate]) -> dict[Key, list[Estimate]]:

@@ -112,17 +112,23 @@ def re_symmetric(T_est: Poses, T_gt: Poses, symmetries: Symmetries) -> Errors:
 
 
 def te(T_est: Poses, T_gt: Poses) -> Errors:
-    """Distance between the object's origins, metres."""
+    """Distance between the poses' origins, metres; of the object's centres for poses of the centre.
+
+    A rotation about the centre moves an origin off it: take poses of the centre (`posecore.se3.with_origin_at`).
+    """
     return np.asarray(np.linalg.norm(te_axes(T_est, T_gt), axis=-1))
 
 
 def te_axes(T_est: Poses, T_gt: Poses) -> Float[np.ndarray, "*b 3"]:
-    """Estimated minus ground-truth origin along the camera's x (right), y (down) and z (forward), metres, signed."""
+    """Estimated minus ground-truth origin along the camera's x (right), y (down) and z (forward), metres, signed.
+
+    Of the object's centre for poses of the centre, see `te`.
+    """
     return np.asarray(T_est[..., :3, 3] - T_gt[..., :3, 3])
 
 
 def viewpoint_deg(T_cam_obj: Poses) -> tuple[Errors, Errors]:
-    """Direction of the camera seen from the object, degrees: azimuth about z from x, elevation over the xy plane."""
+    """Direction of the camera seen from the poses' origins, degrees: azimuth about z from x, elevation over xy."""
     x, y, z = np.moveaxis(-(_inverse(T_cam_obj[..., :3, :3]) @ T_cam_obj[..., :3, 3:])[..., 0], -1, 0)
     return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
+from posecore import se3
 from posecore.bop import ModelInfo, symmetry_transforms
 from posecore.mesh import Mesh
 from posecore.symmetry import align_ball, is_ball
@@ -21,10 +22,17 @@ ERRORS = (
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A mesh for pose errors, with its convex hull, symmetries and neighbour search."""
+    """A mesh for pose errors, with its convex hull, symmetries and neighbour search, in the object's own frame.
+
+    Attributes:
+        mesh: its vertices are the model points.
+        info: diameter and symmetries.
+        center_m: the object's centre: that of the full model where `mesh` is a simplified one.
+    """
 
     mesh: Mesh
     info: ModelInfo
+    center_m: Float[np.ndarray, "3"]
     nearest: NearestPoints = field(init=False)
     hull_m: Float[np.ndarray, "h 3"] = field(init=False)
     symmetries: Float[np.ndarray, "s 4 4"] = field(init=False)
@@ -34,6 +42,10 @@ class Model:
         object.__setattr__(self, "nearest", NearestPoints(points_m))
         object.__setattr__(self, "hull_m", hull(points_m))
         object.__setattr__(self, "symmetries", symmetry_transforms(self.info))
+
+    def of_center(self, T_cam_obj: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+        """Poses of the object's centre: the same axes, the origin at the centre."""
+        return se3.with_origin_at(T_cam_obj, self.center_m)
 
     def symmetries_of(
         self, T_est: Float[np.ndarray, "b 4 4"], T_gt: Float[np.ndarray, "b 4 4"]
@@ -59,7 +71,8 @@ def pose_errors(
     """
     points_m, symmetries = np.asarray(model.mesh.vertices_m, np.float64), model.symmetries_of(T_est, T_gt)
     mspd_px, proj_px, proj_sym_px = metrics.projection_errors(T_est, T_gt, K, points_m, symmetries)
-    dx_m, dy_m, dz_m = metrics.te_axes(T_est, T_gt).T
+    centers = (model.of_center(T_est), model.of_center(T_gt))
+    dx_m, dy_m, dz_m = metrics.te_axes(*centers).T
     values = (
         metrics.add(T_est, T_gt, points_m),
         metrics.adi(T_est, T_gt, model.nearest),
@@ -67,7 +80,7 @@ def pose_errors(
         *(mspd_px, proj_px, proj_sym_px),
         metrics.re(T_est, T_gt),
         metrics.re_symmetric(T_est, T_gt, symmetries),
-        metrics.te(T_est, T_gt),
+        metrics.te(*centers),
         *(dx_m, dy_m, dz_m),
     )
     return dict(zip(ERRORS, values, strict=True))

@@ -54,10 +54,11 @@ class Scorer:
             DatasetError: a model is missing, or VSS of visible parts needs depth that an image does not have.
         """
         instances, estimates = [pair.gt for pair in pairs], [pair.estimate for pair in pairs]
-        infos = [self.model(gt.obj_id).info for gt in instances]
+        models = [self.model(gt.obj_id) for gt in instances]
         cameras = [self.camera(pair.scene_id, pair.im_id) for pair in pairs]
-        T_gt = np.array([gt.T_cam_obj for gt in instances], np.float64).reshape(-1, 4, 4)
-        azimuth_deg, elevation_deg = metrics.viewpoint_deg(T_gt)
+        centers = [model.of_center(gt.T_cam_obj) for model, gt in zip(models, instances, strict=True)]
+        T_gt_center = np.array(centers, np.float64).reshape(-1, 4, 4)
+        azimuth_deg, elevation_deg = metrics.viewpoint_deg(T_gt_center)
         vss, vsd = self._silhouettes(pairs)
         nan = np.nan
         columns: dict[str, Sequence[Any] | np.ndarray] = {
@@ -74,10 +75,10 @@ class Scorer:
             "initial_translation_diameter": [
                 nan if pair.level is None else pair.level.translation_diameter for pair in pairs
             ],
-            "diameter_m": [info.diameter_m for info in infos],
-            "symmetric": [info.is_symmetric for info in infos],
+            "diameter_m": [model.info.diameter_m for model in models],
+            "symmetric": [model.info.is_symmetric for model in models],
             "image_width_px": [camera.width_px for camera in cameras],
-            "distance_m": T_gt[:, 2, 3],
+            "distance_m": T_gt_center[:, 2, 3],
             "view_azimuth_deg": azimuth_deg,
             "view_elevation_deg": elevation_deg,
             "other_mssd_m": self._other_mssd_m(pairs),
@@ -97,7 +98,8 @@ class Scorer:
         if obj_id not in self._models:
             if obj_id not in self.dataset.models_info:
                 raise DatasetError(f"{self.dataset.root}: models_info.json has no object {obj_id}; add its diameter")
-            model = Model(mesh=self.dataset.mesh(obj_id, eval=True), info=self.dataset.models_info[obj_id])
+            mesh, info = self.dataset.mesh(obj_id, eval=True), self.dataset.models_info[obj_id]
+            model = Model(mesh=mesh, info=info, center_m=self.dataset.center_m(obj_id))
             self.rasteriser.add(obj_id, model.mesh)
             self._models[obj_id] = model
         return self._models[obj_id]

@@ -52,6 +52,10 @@ def summarise(dataset: BopDataset, scored: Sequence[Scored], vss: VssKind) -> di
     return cleaned
 
 
+def _causes(item: Scored, infos: Mapping[int, ModelInfo]) -> "pd.Series[str]":
+    return causes(item.table, item.T_est, item.T_gt, item.center_m, infos)
+
+
 def _file_summary(item: Scored, distance_edges_m: Sequence[float], infos: Mapping[int, ModelInfo]) -> dict[str, Any]:
     sidecar = {key: value for key, value in item.file.sidecar.items() if key not in ("perturbation", "initial_lines")}
     return {
@@ -68,7 +72,7 @@ def _file_summary(item: Scored, distance_edges_m: Sequence[float], infos: Mappin
         },
         "by_level": by_level(item.table),
         "bins": bins_of(item.table, distance_edges_m),
-        "causes": cause_counts(item.table, causes(item.table, item.T_est, item.T_gt, infos)).to_dict("index"),
+        "causes": cause_counts(item.table, _causes(item, infos)).to_dict("index"),
         "intervals": {
             "total": score_intervals(item.table).as_json(),
             "by_object": {

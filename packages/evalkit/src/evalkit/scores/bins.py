@@ -98,7 +98,7 @@ def by_visibility(table: pd.DataFrame, edges: Sequence[float] = VISIBILITY_EDGES
 
 
 def by_distance(table: pd.DataFrame, edges_m: Sequence[float] | None = None, **options: Any) -> pd.DataFrame:
-    """Scores by camera z of the ground-truth origin, metres.
+    """Scores by camera z of the object's centre at the ground truth, metres.
 
     By default the edges are round numbers from the smallest to the largest distance.
     """

@@ -33,9 +33,9 @@ CURVE_DEFINITIONS: Mapping[str, str] = {
     "level": "rotation of the ground-truth pose, or its translation in diameters of the object",
     "under 5°, 10°, ...": "fraction of all initial poses of a level with a final rotation error (at the best symmetry) "
     "under the limit, which an error of exactly the limit and a missing estimate are not",
-    "under 0.1 d, ...": "the same for the final distance of the origins, in diameters",
+    "under 0.1 d, ...": "the same for the final distance of the centres, in diameters",
     "diverged": "fraction of all initial poses of a level with a final rotation error over 45°, a final distance of "
-    "the origins over half a diameter, or no estimate",
+    "the centres over half a diameter, or no estimate",
     "mean final error": "over the initial poses of a level that have an estimate",
 }
 

@@ -34,8 +34,9 @@ DEFINITIONS: Mapping[str, str] = {
     "AUC": "area under the recall curve for thresholds from 0 to 100 mm (or to 0.1 diameter where a table has it), "
     "1 at best, as an exact integral; PoseCNN's script sums steps and comes out higher by up to 1 / poses",
     "rotation": "angle between estimated and ground-truth rotation, over found poses; 'sym.' is at the best symmetry",
-    "x, y, z": "absolute difference of the object's origin along the camera's right, down and forward axes, mm",
-    "5 cm 5°": "fraction with a distance of origins under 5 cm and a rotation error (at the best symmetry) under 5°",
+    "x, y, z": "absolute difference of the object's centre (middle of its bounding box) along the camera's right, down "
+    "and forward axes, mm",
+    "5 cm 5°": "fraction with a distance of centres under 5 cm and a rotation error (at the best symmetry) under 5°",
     "proj. 5 px": "fraction with an average distance of projected model points (at the best symmetry) under 5 pixels",
     "AR MSSD": "BOP19: mean recall of the maximum surface distance at 0.05, 0.10, ... 0.50 diameter",
     "AR MSPD": "BOP19: mean recall of the maximum projected distance at 5, 10, ... 50 px times image width / 640",
@@ -51,7 +52,7 @@ DEFINITIONS: Mapping[str, str] = {
     "BOP matching": "estimates in order of score take the free instance with the smallest error, "
     "for every error and threshold anew; for AR only the inst_count most visible instances and the inst_count best "
     "scored estimates take part",
-    "diverged": "fraction with a rotation error (at the best symmetry) over 45 degrees or a distance of origins over "
+    "diverged": "fraction with a rotation error (at the best symmetry) over 45 degrees or a distance of centres over "
     "half a diameter; missing ones included",
     "diameter": "the largest distance between two model points, as models_info.json gives it",
     "missing": "an expected pose without an estimate: a failure in every fraction, recall and area, and VSS 0; means "

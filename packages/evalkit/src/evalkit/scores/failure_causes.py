@@ -2,24 +2,25 @@
 
 A pose has failed where it is missing, or where its ADD(-S) is not under a limit, 0.1 diameter by default. Its error is
 decomposed in the camera's frame. The ground truth is the symmetry-equivalent pose with the smallest angle to the
-estimate. The viewing ray runs from the camera's centre through the ground-truth origin.
+estimate. The viewing ray runs from the camera's centre through the object's, the
+middle of its bounding box, at the ground truth.
 
-- z: the difference of origins along the ray, metres.
+- z: the difference of the object's centres along the ray, metres.
 - xy: the difference across the ray, metres.
 - in plane: the angle of the rotation error's twist about the ray.
 - out of plane: the angle of the rest of the rotation error (swing), about an axis across the ray.
 - An angle a displaces model points by about 2 * 0.27 * sin(a / 2) diameters, so angles and lengths are comparable:
-  0.27 diameters is the mean distance of points from an axis through the origin (0.24 to 0.30 for LM-O's objects).
+  0.27 diameters is the mean distance of points from an axis through the centre (0.24 to 0.30 for LM-O's objects).
 
 The first of these that holds is the cause:
 
 1. `missed`: there is no estimate.
 2. `wrong instance`: MSSD to another instance of the object in the image is under 0.2 diameter, and smaller than to the
    expected one.
-3. `flip`: the rotation error is 160 degrees or more, about 180 degrees about some axis, and the origins differ by less
+3. `flip`: the rotation error is 160 degrees or more, about 180 degrees about some axis, and the centres differ by less
    than the limit.
 4. `near-symmetric flip`: the rotation error is 45 degrees or more, yet VSS is 0.8 or more, a similar silhouette;
-   and the origins differ by less than the limit.
+   and the centres differ by less than the limit.
 5. `z only`, `in plane only` (xy and in plane), `rotation only` (in plane and out of plane): without these parts, the
    displacement by the others (root of the sum of squares) is under the limit, so that the pose would pass. Of several
    such causes the one with the least remaining displacement counts, and of equal ones the first in this list.
@@ -50,8 +51,8 @@ ARM_DIAMETERS = 0.27
 CAUSES: Mapping[str, str] = {
     "missed": "no estimate",
     "wrong instance": "within 0.2 diameter (MSSD) of another instance of the object, closer than to the expected one",
-    "flip": "rotation error of 160° or more, about 180° about some axis, with the origin in place",
-    "near-symmetric flip": "rotation error of 45° or more but VSS of 0.8 or more, with the origin in place",
+    "flip": "rotation error of 160° or more, about 180° about some axis, with the centre in place",
+    "near-symmetric flip": "rotation error of 45° or more but VSS of 0.8 or more, with the centre in place",
     "z only": "would pass without its error along the viewing ray",
     "in plane only": "would pass without its translation across the viewing ray and its rotation about the ray",
     "rotation only": "would pass without its rotation error",
@@ -81,15 +82,15 @@ class Parts:
 
 
 def parts_of(T_est: Float[np.ndarray, "n 4 4"], T_gt: Float[np.ndarray, "n 4 4"]) -> Parts:
-    """Decompose errors about the viewing ray of each ground-truth pose."""
-    origin = T_gt[:, :3, 3]
-    length = np.linalg.norm(origin, axis=1, keepdims=True)
-    ray = np.divide(origin, length, out=np.tile([0.0, 0.0, 1.0], (len(origin), 1)), where=length > 0)
-    shift = T_est[:, :3, 3] - origin
+    """Decompose errors about the viewing ray of each ground-truth pose; poses are those of the object's centre."""
+    center = T_gt[:, :3, 3]
+    length = np.linalg.norm(center, axis=1, keepdims=True)
+    ray = np.divide(center, length, out=np.tile([0.0, 0.0, 1.0], (len(center), 1)), where=length > 0)
+    shift = T_est[:, :3, 3] - center
     z_m = np.sum(shift * ray, axis=1)
     xy_m = np.linalg.norm(shift - z_m[:, None] * ray, axis=1)
     is_valid = np.isfinite(T_est).all(axis=(1, 2)) & np.isfinite(T_gt).all(axis=(1, 2))
-    quat = np.full((len(origin), 4), np.nan)
+    quat = np.full((len(center), 4), np.nan)
     if is_valid.any():
         R = T_est[is_valid, :3, :3] @ np.swapaxes(T_gt[is_valid, :3, :3], 1, 2)
         quat[is_valid] = se3.quat_wxyz_from_rotation(R)
@@ -109,6 +110,7 @@ def causes(
     table: pd.DataFrame,
     T_est: Float[np.ndarray, "n 4 4"],
     T_gt: Float[np.ndarray, "n 4 4"],
+    center_m: Float[np.ndarray, "n 3"],
     infos: Mapping[int, Symmetric] | None = None,
     *,
     limit_diameters: float = RECALL_DIAMETERS,
@@ -119,6 +121,7 @@ def causes(
         table: see `evalkit.error_table`.
         T_est: estimates `T_cam_obj` of its rows, metres, NaN where missing.
         T_gt: ground-truth poses.
+        center_m: centre of each row's object, object frame, metres.
         infos: symmetries of the objects; objects without an entry have none.
         limit_diameters: an ADD(-S) of so many diameters or more is a failure.
 
@@ -132,7 +135,7 @@ def causes(
         rows = np.flatnonzero(failed & (table.obj_id.to_numpy() == obj_id))
         if (info.symmetries_discrete or info.symmetries_continuous) and len(rows):
             T_nearest[rows] = nearest_symmetric(T_nearest[rows], T_est[rows], info)
-    parts = parts_of(T_est, T_nearest)
+    parts = parts_of(se3.with_origin_at(T_est, center_m), se3.with_origin_at(T_nearest, center_m))
     is_found = column(table, "found") > 0
     other = column(table, "other_mssd_m")
     chosen = np.full(len(table), SOLVED, dtype=object)

@@ -67,7 +67,7 @@ POSE_COLUMNS = (
     *_mean_and_median("camera z", "tz_mm", "mm"),
 )
 SURFACE_COLUMNS = (
-    *_mean_and_median("origin", "te_mm", "mm"),
+    *_mean_and_median("centre", "te_mm", "mm"),
     *_mean_and_median("ADD", "add_mm", "mm"),
     *_mean_and_median("ADI", "adi_mm", "mm"),
     *_mean_and_median("MSSD", "mssd_mm", "mm"),
@@ -81,21 +81,21 @@ SCORE_TABLES = (
     ("Areas under recall curves", "areas", AREA_COLUMNS, ""),
     ("6D detection", "precision", PRECISION_COLUMNS, PRECISION_NOTE),
     ("Rotation and translation errors", "pose-errors", POSE_COLUMNS, ERRORS_NOTE),
-    ("Distances of origins, surfaces and projections", "surface-errors", SURFACE_COLUMNS, ERRORS_NOTE),
+    ("Distances of centres, surfaces and projections", "surface-errors", SURFACE_COLUMNS, ERRORS_NOTE),
 )
 """Title, name, columns and note of the tables of every file, in total and by object."""
 COMPARED = (
     _column("", "VSS mean", "vss_mean", "", 3, "higher"),
     _column("", "ADD(-S) recall at 0.1 diameter", "add_s_recall_0.1d", "%", 1, "higher"),
     _column("", "Median rotation error (best symmetry)", "re_sym_deg_median", "deg", 1, "lower"),
-    _column("", "Median distance of the origins", "te_mm_median", "mm", 1, "lower"),
+    _column("", "Median distance of the centres", "te_mm_median", "mm", 1, "lower"),
 )
 """Scores compared between files, object by object."""
 
 
 BIN_AXES: Mapping[str, tuple[str, str, float]] = {
     "visibility": ("visible fraction of the ground-truth silhouette", "visib_fract", 1.0),
-    "distance": ("camera z of the object's origin, m", "distance_m", 1.0),
+    "distance": ("camera z of the object's centre, m", "distance_m", 1.0),
     "azimuth": ("camera's azimuth seen from the object, degrees", "view_azimuth_deg", 1.0),
     "elevation": ("camera's elevation seen from the object, degrees", "view_elevation_deg", 1.0),
 }

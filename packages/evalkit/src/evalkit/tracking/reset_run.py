@@ -11,8 +11,9 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
+from posecore import se3
+from posecore.bop import ModelInfo
 from posecore.errors import ConfigError
-from posecore.symmetry import Symmetric
 
 from evalkit.tracking.residuals import residuals
 from evalkit.tracking.scores import LIMIT_M, LIMIT_RAD
@@ -65,7 +66,8 @@ def run_with_resets(
     frames: Iterable[Frame],
     T_gt: Iterable[Float[np.ndarray, "4 4"]],
     *,
-    info: Symmetric | None = None,
+    center_m: Float[np.ndarray, "3"],
+    info: ModelInfo | None = None,
 ) -> ResetRun:
     """Track a sequence under RBOT's protocol.
 
@@ -76,12 +78,14 @@ def run_with_resets(
         tracker: to evaluate.
         frames: its inputs in order; only one is held at a time.
         T_gt: ground-truth pose `T_cam_obj` of each frame, metres.
+        center_m: centre of the object (`Mesh.center_m`), which the 5 cm are measured at, object frame, metres.
         info: symmetries of the object, None for none.
 
     Raises:
         ConfigError: there is no frame, or a frame without a ground-truth pose.
         ValueError: frames and poses differ in number.
     """
+    about_center = None if info is None else info.with_origin_at(center_m)
     poses, was_initialised, tracked, times = [], [], [], []
     for number, (frame, pose_gt) in enumerate(zip(frames, T_gt, strict=True)):
         if not np.isfinite(pose_gt).all():
@@ -91,7 +95,7 @@ def run_with_resets(
             begun = perf_counter()
             pose = tracker.track(frame)
             time_s = perf_counter() - begun
-            is_tracked = pose is not None and _is_tracked(pose, pose_gt, info)
+            is_tracked = pose is not None and _is_tracked(pose, pose_gt, center_m, about_center)
         if not is_tracked:
             tracker.initialise(frame, pose_gt)
         poses.append(np.full((4, 4), np.nan) if pose is None else np.asarray(pose, np.float64))
@@ -110,6 +114,12 @@ def run_with_resets(
     )
 
 
-def _is_tracked(T_est: Float[np.ndarray, "4 4"], T_gt: Float[np.ndarray, "4 4"], info: Symmetric | None) -> bool:
-    errors = residuals(np.asarray(T_est, np.float64)[None], np.asarray(T_gt, np.float64)[None], info)
+def _is_tracked(
+    T_est: Float[np.ndarray, "4 4"],
+    T_gt: Float[np.ndarray, "4 4"],
+    center_m: Float[np.ndarray, "3"],
+    info: ModelInfo | None,
+) -> bool:
+    est, gt = (se3.with_origin_at(np.asarray(T, np.float64)[None], center_m) for T in (T_est, T_gt))
+    errors = residuals(est, gt, info)
     return bool((errors.distance_m[0] < LIMIT_M) and (errors.angle_rad[0] < LIMIT_RAD))

@@ -1,4 +1,4 @@
-"""Residuals of tracked poses in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
+"""Residuals of tracked poses of the object's centre, in camera axes: `R_est R_gt^-1` and `t_est - t_gt`.
 
 For objects with symmetries, the residual is to the symmetry-equivalent ground truth nearest in rotation.
 """
@@ -33,7 +33,7 @@ class Residuals:
 
     @property
     def distance_m(self) -> Float[np.ndarray, " n"]:
-        """Distance of the origins."""
+        """Distance of the centres."""
         return np.asarray(np.linalg.norm(self.dt_m, axis=1))
 
 
@@ -43,9 +43,9 @@ def residuals(
     """Residuals of a sequence, frames in order.
 
     Args:
-        T_est: estimates `T_cam_obj`, metres, NaN where there is none.
+        T_est: estimated poses of the centre, metres, NaN where there is none.
         T_gt: ground truth.
-        info: symmetries of the object, None for none.
+        info: symmetries in the same frame, None for none.
     """
     R, dt_m = _to_copies(T_est[:, :3, :3], T_est, T_gt, info)
     chosen = _nearest_copies(R)

@@ -14,11 +14,11 @@ AXES = ("x", "y", "z")
 ANGLES = ("roll", "pitch", "yaw")
 
 TRACKING_DEFINITIONS: Mapping[str, str] = {
-    "x, y, z": "root mean square of estimated minus ground-truth origin along the camera's right, down and forward "
+    "x, y, z": "root mean square of estimated minus ground-truth centre along the camera's right, down and forward "
     "axes, over the frames with an estimate of the tracker, without frames in which it was initialised",
     "roll, pitch, yaw": "root mean square of the Euler angles of R_est R_gt^-1 = Rz(yaw) Ry(pitch) Rx(roll), camera "
     "axes: no wrap-around, no gimbal lock near the ground truth",
-    "5 cm 5°": "fraction of frames with a distance of origins under 5 cm and a rotation error under 5°; frames without "
+    "5 cm 5°": "fraction of frames with a distance of centres under 5 cm and a rotation error under 5°; frames without "
     "an estimate fail. With `resets` in the sidecar it is RBOT's protocol: frames in which the tracker was reset to "
     "the ground truth count as failed; the first frame of a sequence is not counted",
     "lost": "frames without an estimate",

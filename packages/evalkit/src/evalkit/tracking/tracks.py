@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
+from posecore import se3
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
 from posecore.bop.perturbation import instances_of
 from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
 
+from evalkit.inputs.pairing import distances_of_centers_m
 from evalkit.inputs.result_files import ResultFile
 
 
@@ -27,11 +29,11 @@ class SequenceTrack:
         name: for tables.
         im_id: (n,) images.
         frame: (n,) indices of the images in the sequence: neighbours differ by 1.
-        T_est: (n, 4, 4) estimates, metres, NaN where there is none.
-        T_gt: (n, 4, 4) ground truth.
+        T_est: (n, 4, 4) estimates of the object's centre, metres, NaN where there is none.
+        T_gt: (n, 4, 4) ground truth of the centre.
         time_s: (n,) run times, NaN or negative where unknown.
         was_initialised: (n,) frames in which the tracker was set to the ground truth, None for a run without resets.
-        info: symmetries.
+        info: symmetries in the frame about the centre.
     """
 
     scene_id: int
@@ -63,7 +65,7 @@ def tracks_of(
             first frame of a sequence and, under RBOT's protocol, every failed frame. The file's poses of these frames
             are not scored.
         table: `scene_id`, `im_id`, `obj_id`, `gt_index` and `time_s`, one row for each expected pose.
-        T_est: (n, 4, 4) estimates, metres, NaN where missing.
+        T_est: (n, 4, 4) estimates of the objects' own origins, as files hold them, metres, NaN where missing.
         T_gt: (n, 4, 4) ground truth.
 
     Raises:
@@ -87,6 +89,7 @@ def tracks_of(
                 f"{file.path}: object {obj_id} in scene {scene_id}, image {twice} has several poses of the object; "
                 "a tracked sequence has one (perturbed initial poses are for `evalkit report`)"
             )
+        center_m = dataset.center_m(int(obj_id))
         mark = f", instance {instance + 1}" if (scene_id, obj_id) in several else ""
         tracks.append(
             SequenceTrack(
@@ -96,11 +99,11 @@ def tracks_of(
                 name=f"scene {scene_id}, object {obj_id}{mark}",
                 im_id=images,
                 frame=np.searchsorted(np.array(dataset.im_ids(int(scene_id))), images).astype(np.int64),
-                T_est=T_est[rows],
-                T_gt=T_gt[rows],
+                T_est=se3.with_origin_at(T_est[rows], center_m),
+                T_gt=se3.with_origin_at(T_gt[rows], center_m),
                 time_s=time_s[rows],
                 was_initialised=_were_initialised(resets, images, int(scene_id), int(obj_id), int(instance)),
-                info=dataset.models_info[int(obj_id)],
+                info=dataset.models_info[int(obj_id)].with_origin_at(center_m),
             )
         )
     return tracks
@@ -124,7 +127,7 @@ def frames_of(
     """Every expected pose with its estimate, as arguments of `tracks_of`.
 
     Of the estimates of an object in an image those with the highest scores count, as many as there are instances; they
-    go to the instances so that distances of the origins add up to the least.
+    go to the instances so that distances of the centres add up to the least.
 
     Args:
         dataset: with ground truth.
@@ -143,7 +146,7 @@ def frames_of(
         key = (target.scene_id, target.im_id, target.obj_id)
         instances = sorted(instances_of(dataset, target)[: target.inst_count], key=lambda gt: gt.gt_index)
         best = sorted(estimates[key], key=lambda estimate: -estimate.score)[: len(instances)]
-        matched = _matched(best, instances)
+        matched = _matched(dataset, best, instances)
         for index, gt in enumerate(instances):
             of_instance = matched.get(index)
             rows.append((*key, gt.gt_index, np.nan if of_instance is None else of_instance.time_s))
@@ -164,12 +167,13 @@ def _every_pose(dataset: BopDataset) -> list[BopTarget]:
     return targets
 
 
-def _matched(estimates: Sequence[Estimate], instances: Sequence[GroundTruth]) -> dict[int, Estimate]:
+def _matched(
+    dataset: BopDataset, estimates: Sequence[Estimate], instances: Sequence[GroundTruth]
+) -> dict[int, Estimate]:
     """Estimate of each instance by its index."""
     if len(instances) == 1:
         return dict(enumerate(estimates))
-    distance = [[np.linalg.norm(e.T_cam_obj[:3, 3] - gt.T_cam_obj[:3, 3]) for gt in instances] for e in estimates]
-    which, indices = linear_sum_assignment(np.array(distance).reshape(len(estimates), len(instances)))
+    which, indices = linear_sum_assignment(distances_of_centers_m(dataset, estimates, instances))
     return {int(index): estimates[int(number)] for number, index in zip(which, indices, strict=True)}
 
 

@@ -369,6 +369,13 @@ class BopDataset:
             self._meshes[path] = load_mesh(path, units="mm")
         return self._meshes[path]
 
+    def center_m(self, obj_id: int) -> Float[np.ndarray, "3"]:
+        """Centre of an object, in its frame, metres: `Mesh.center_m` of the full model.
+
+        That of a simplified model differs, by up to 0.4 mm on LM-O.
+        """
+        return self.mesh(obj_id).center_m
+
 
 def _is_models(name: str) -> bool:
     return name == "models" or name.startswith("models_")

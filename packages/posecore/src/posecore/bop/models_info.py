@@ -1,6 +1,6 @@
 """models_info.json: diameters and symmetries of a dataset's objects."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,20 @@ class ModelInfo:
     def is_symmetric(self) -> bool:
         """Whether any symmetry is listed."""
         return bool(self.symmetries_discrete or self.symmetries_continuous)
+
+    def with_origin_at(self, point_m: Float[np.ndarray, "3"]) -> "ModelInfo":
+        """The entry in the frame with the same axes and its origin at a point, metres."""
+        point_m = np.asarray(point_m, np.float64)
+        there, back = se3.make_T(np.eye(3), point_m), se3.make_T(np.eye(3), -point_m)
+        axes = []
+        for axis, offset_m in self.symmetries_continuous:
+            x, y, z = as_list(np.array(offset_m) - point_m)
+            axes.append(ContinuousSymmetry(axis, (x, y, z)))
+        return replace(
+            self,
+            symmetries_discrete=tuple(back @ T @ there for T in self.symmetries_discrete),
+            symmetries_continuous=tuple(axes),
+        )
 
 
 def load_models_info(path: str | Path) -> dict[int, ModelInfo]:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from posecore import se3
 from posecore.bop.dataset import BopDataset, BopTarget, GroundTruth
@@ -54,9 +55,8 @@ def perturb_dataset(
 ) -> int:
     """Write initial poses for every target, and in the sidecar the level of every line; the number of lines.
 
-    A pose is rotated by exactly its angle about a random axis through the object's origin (in camera axes) and
-    translated by exactly its length in a random direction. The draws depend on the seed, the target's ids and the
-    previous levels.
+    A pose is rotated by its angle about a random axis through the object's centre (in camera axes) and translated by
+    its length in a random direction. The draws depend on the seed, the target's ids and the previous levels.
 
     Args:
         dataset: with ground truth.
@@ -66,7 +66,7 @@ def perturb_dataset(
         random_up_to: one more line for each target, angle and length drawn uniformly from 0 up to these; None for none.
         depth_stretch: factor on the random line's translation along the viewing ray; its level is the stretched one.
         protocol: name of the published experiment that the levels are of, for the sidecar.
-        obj_ids: objects to take, None for all; the poses of the others do not depend on it.
+        obj_ids: objects to take, None for all.
         program: name and version of the program that writes the file, for the sidecar.
 
     Raises:
@@ -80,15 +80,17 @@ def perturb_dataset(
     rows: list[dict[str, Any]] = []
     for target in (target for target in dataset.targets if obj_ids is None or target.obj_id in obj_ids):
         diameter_m = dataset.models_info[target.obj_id].diameter_m
+        center_m = dataset.center_m(target.obj_id)
         for gt in instances_of(dataset, target)[: target.inst_count]:
             rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, gt.gt_index])
             drawn = [_drawn(random_up_to, rng)] if random_up_to else []
             for number, level in enumerate([*levels, *drawn]):
                 random = number >= len(levels)
-                initial = _perturbed(target, gt, level, diameter_m, rng)
+                T_gt = se3.with_origin_at(gt.T_cam_obj, center_m)
+                T = se3.perturb(T_gt, float(np.deg2rad(level.angle_deg)), level.translation_diameter * diameter_m, rng)
                 if random and depth_stretch != 1:
-                    initial, level = _stretched(initial, gt, level, diameter_m, depth_stretch)
-                estimates.append(initial)
+                    T, level = _stretched(T, T_gt, target, level, diameter_m, depth_stretch)
+                estimates.append(_estimate(target, se3.with_origin_at(T, -center_m)))
                 rows.append(_sidecar_row(len(estimates) + 1, target, gt, level) | {"random": random})
     sidecar = {
         "dataset": str(dataset.root.resolve()),
@@ -108,30 +110,27 @@ def _drawn(limit: Level, rng: np.random.Generator) -> Level:
     )
 
 
-def _perturbed(
-    target: BopTarget, gt: GroundTruth, level: Level, diameter_m: float, rng: np.random.Generator
-) -> Estimate:
-    distance_m = level.translation_diameter * diameter_m
-    return Estimate(
-        scene_id=target.scene_id,
-        im_id=target.im_id,
-        obj_id=target.obj_id,
-        T_cam_obj=se3.perturb(gt.T_cam_obj, float(np.deg2rad(level.angle_deg)), distance_m, rng),
-    )
+def _estimate(target: BopTarget, T_cam_obj: Float[np.ndarray, "4 4"]) -> Estimate:
+    return Estimate(scene_id=target.scene_id, im_id=target.im_id, obj_id=target.obj_id, T_cam_obj=np.asarray(T_cam_obj))
 
 
 def _stretched(
-    initial: Estimate, gt: GroundTruth, level: Level, diameter_m: float, factor: float
-) -> tuple[Estimate, Level]:
-    """The initial pose with its depth error times a factor, and its level."""
-    T = se3.stretched_along_ray(gt.T_cam_obj, initial.T_cam_obj, factor)
+    initial: Float[np.ndarray, "4 4"],
+    T_gt: Float[np.ndarray, "4 4"],
+    target: BopTarget,
+    level: Level,
+    diameter_m: float,
+    factor: float,
+) -> tuple[Float[np.ndarray, "4 4"], Level]:
+    """The initial pose of the centre with its depth error times a factor, and its level."""
+    T = se3.stretched_along_ray(T_gt, initial, factor)
     if T[2, 3] <= 0:
         raise ConfigError(
-            f"--depth-stretch {factor:g}: puts object {initial.obj_id} of image {initial.im_id}, "
-            f"scene {initial.scene_id}, behind the camera; lower it or --random-translation"
+            f"--depth-stretch {factor:g}: puts object {target.obj_id} of image {target.im_id}, "
+            f"scene {target.scene_id}, behind the camera; lower it or --random-translation"
         )
-    distance_diameter = float(np.linalg.norm(T[:3, 3] - gt.T_cam_obj[:3, 3])) / diameter_m
-    return replace(initial, T_cam_obj=T), replace(level, translation_diameter=distance_diameter)
+    distance_diameter = float(np.linalg.norm(T[:3, 3] - T_gt[:3, 3])) / diameter_m
+    return T, replace(level, translation_diameter=distance_diameter)
 
 
 def _sidecar_row(line: int, target: BopTarget, gt: GroundTruth, level: Level) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from posecore.bop.dataset import BopDataset
-from posecore.bop.jsonfile import read_json
+from posecore.bop.jsonfile import as_list, read_json
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
 from posecore.errors import ResultFileError
@@ -152,11 +152,12 @@ def metres_fault(table: ResultTable) -> LineFault | None:
     """Fault if a file's translations are probably in metres, else None."""
     if not len(table):
         return None
-    median_mm = float(np.median(np.abs(table.T_cam_obj[:, 2, 3]))) / MM
+    # The length, not t_z: an origin off the object may lie beside the camera.
+    median_mm = float(np.median(np.linalg.norm(table.T_cam_obj[:, :3, 3], axis=1))) / MM
     if median_mm >= SUSPICIOUS_DISTANCE_MM:
         return None
     message = (
-        f"the median t_z of the file is {median_mm:.4g}, probably in metres; "
+        f"the median length of t in the file is {median_mm:.4g}, probably in metres; "
         "BOP result files hold millimetres, multiply t by 1000"
     )
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
@@ -224,11 +225,15 @@ def read_sidecar(path: str | Path) -> dict[str, Any] | None:
 
 
 def write_results(path: str | Path, estimates: Sequence[Estimate], sidecar: dict[str, Any] | None = None) -> None:
-    """Write a result file atomically, millimetres with nine decimals; the sidecar first, where given."""
+    """Write a result file atomically, in millimetres; the sidecar first, where given.
+
+    Numbers have all their digits, as bop_toolkit writes them: an origin metres off the object is a long lever for a
+    rounded rotation.
+    """
     lines = [HEADER]
     for estimate in estimates:
-        R = " ".join(f"{value:.9f}" for value in estimate.T_cam_obj[:3, :3].reshape(-1))
-        t = " ".join(f"{value:.9f}" for value in estimate.T_cam_obj[:3, 3] / MM)
+        R = " ".join(map(repr, as_list(estimate.T_cam_obj[:3, :3])))
+        t = " ".join(map(repr, as_list(estimate.T_cam_obj[:3, 3] / MM)))
         ids = f"{estimate.scene_id},{estimate.im_id},{estimate.obj_id}"
         lines.append(f"{ids},{estimate.score:.9g},{R},{t},{estimate.time_s:.9g}")
     if sidecar is not None:

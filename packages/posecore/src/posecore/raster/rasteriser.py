@@ -15,6 +15,7 @@ import moderngl
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from posecore import se3
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
 from posecore.raster.context import thread_device
@@ -210,7 +211,7 @@ class Rasteriser:
     ) -> None:
         mesh = self._mesh(instance.obj_id)
         coloured, depth_only = self._array(instance.obj_id, mesh)
-        T = np.asarray(instance.T_cam_obj, np.float64)
+        T = se3.with_origin_at(np.asarray(instance.T_cam_obj, np.float64), mesh.center_m)
         center_z_m, near_m = self._center_z_m(instance), depth_range_m[0]
         if center_z_m + mesh.diameter_m <= near_m:
             return
@@ -248,7 +249,7 @@ class Rasteriser:
         return np.frombuffer(data, np.float32).reshape(height, width, components)
 
     def _center_z_m(self, instance: Instance) -> float:
-        """Camera z of the box centre, as the origin may lie metres off the mesh. No vertex is a diameter from it."""
+        """Camera z of the mesh's centre. No vertex is a diameter from it."""
         T = instance.T_cam_obj
         return float(T[2, :3] @ self._mesh(instance.obj_id).center_m + T[2, 3])
 
@@ -273,14 +274,16 @@ class Rasteriser:
         return self._meshes[obj_id]
 
     def _array(self, obj_id: int, mesh: Mesh) -> tuple[moderngl.VertexArray, moderngl.VertexArray]:
-        """The mesh as the two programs take it: with colours, and positions alone."""
+        """The mesh as the two programs take it, its origin at the centre: with colours, and positions alone."""
         if obj_id in self._arrays:
             return self._arrays[obj_id]
         mesh = mesh.drawn
         textured = mesh.uv is not None and mesh.texture_rgb is not None
         uv = np.zeros((len(mesh.vertices_m), 2)) if mesh.uv is None else mesh.uv
         colours = mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb  # a factor where there is a texture
-        vertices = np.hstack([mesh.vertices_m, mesh.normals, colours / 255.0, uv]).astype("f4")
+        # About the centre: float32 has no digits to spare for an origin that lies metres off.
+        about_center_m = mesh.vertices_m - mesh.center_m
+        vertices = np.hstack([about_center_m, mesh.normals, colours / 255.0, uv]).astype("f4")
         layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
         positions = (self._context.buffer(np.ascontiguousarray(vertices[:, :3]).tobytes()), "3f", "position")
         index = self._context.buffer(mesh.faces.astype("i4").tobytes())

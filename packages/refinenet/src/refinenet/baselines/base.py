@@ -11,6 +11,7 @@ from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 
 from refinenet.baselines.patch import TrackedObject
+from refinenet.geometry.pivots import PivotFrames
 from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, render_obstacle, require_meshes
 
 SMALL_ANGLE_RAD = np.deg2rad(0.5)
@@ -25,9 +26,15 @@ NOT_VISIBLE = "the object is not visible in the image at the initial pose"
 class Baseline(ABC):
     """A `PoseRefiner` that refines the poses one after the other.
 
+    Inside, an object's origin is its centre: the pivot of updates, and the end of viewing rays and distances.
+
     Args:
         meshes: Objects by id.
         iterations: Renders, each followed by an update, at every resolution or search range.
+
+    Attributes:
+        meshes: As given.
+        iterations: As given.
     """
 
     name: str
@@ -37,8 +44,9 @@ class Baseline(ABC):
 
     def __init__(self, meshes: Mapping[int, Mesh], *, iterations: int = 5) -> None:
         self.iterations = iterations
-        self._meshes = dict(meshes)
-        self._rasteriser = Rasteriser(meshes)
+        self.meshes: Mapping[int, Mesh] = dict(meshes)
+        self._frames = PivotFrames.at_centers(meshes)
+        self._rasteriser = Rasteriser(self._frames.meshes)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -51,7 +59,11 @@ class Baseline(ABC):
         Raises:
             ConfigError: An object has no mesh here.
         """
-        require_meshes(requests, self._meshes)
+        require_meshes(requests, self.meshes)
+        return self._frames.own_results(self._refine_all(frame, self._frames.requests(requests)), requests)
+
+    def _refine_all(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+        """Refine poses of the centres."""
         return [
             self._refine_if_renderable(frame, request.T_cam_obj, self._tracked_object(request)) for request in requests
         ]
@@ -64,7 +76,9 @@ class Baseline(ABC):
         return failed(T_cam_obj, 0, obstacle) if obstacle else self._refine(frame, T_cam_obj, target)
 
     def _tracked_object(self, request: Request) -> TrackedObject:
-        return TrackedObject(obj_id=request.obj_id, mesh=self._meshes[request.obj_id], rasteriser=self._rasteriser)
+        return TrackedObject(
+            obj_id=request.obj_id, mesh=self._frames.meshes[request.obj_id], rasteriser=self._rasteriser
+        )
 
     def close(self) -> None:
         """Free the renderer."""

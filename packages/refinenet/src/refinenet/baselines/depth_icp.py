@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import small_gicp
 from jaxtyping import Float
+from posecore import se3
 from posecore.camera import back_project
 from posecore.errors import DatasetError
 
@@ -25,6 +26,9 @@ MIN_SUPPORT = 0.1
 SUPPORT = 0.05
 """A depth is confirmed within this fraction of the diameter."""
 STEPS = 10
+GRID_M = 2.0**-24
+"""Points are rounded to 60 nm. Neighbours in a depth image are equally far from a point: without that, the last bits of
+floats would decide which are the nearest, and the pose would depend on them by micrometres."""
 
 
 class DepthIcp(Baseline):
@@ -147,7 +151,7 @@ def _align(
     scene = scene[np.linalg.norm(scene - middle_m, axis=1) < diameter_m / 2 + reach_m]
     if len(model) < MIN_POINTS or len(scene) < MIN_POINTS:
         return None
-    source, goal = small_gicp.PointCloud(model - middle_m), small_gicp.PointCloud(scene - middle_m)
+    source, goal = (small_gicp.PointCloud(np.round((points - middle_m) / GRID_M) * GRID_M) for points in (model, scene))
     small_gicp.estimate_normals(goal, num_neighbors=NEIGHBOURS)
     result = small_gicp.align(
         goal,
@@ -159,11 +163,8 @@ def _align(
     )
     if result.num_inliers < MIN_POINTS or not np.isfinite(result.T_target_source).all():
         return None
-    about_origin = np.eye(4)
-    about_origin[:3, 3] = middle_m
-    back = np.eye(4)
-    back[:3, 3] = -middle_m
-    return np.asarray(about_origin @ result.T_target_source @ back @ pose)
+    there, back = se3.make_T(np.eye(3), middle_m), se3.make_T(np.eye(3), -middle_m)
+    return np.asarray(there @ result.T_target_source @ back @ pose)
 
 
 def _points(patch: ObjectPatch, depth_m: Float[np.ndarray, "p p"], n: int) -> Float[np.ndarray, "m 3"]:

@@ -1,4 +1,4 @@
-"""Gauss-Newton steps on se(3) about the object's origin, for residuals in the image plane."""
+"""Gauss-Newton steps on se(3) about the object's centre, for residuals in the image plane."""
 
 import numpy as np
 from jaxtyping import Float
@@ -9,14 +9,17 @@ TUKEY = 4.6851
 
 
 def projection_jacobian(
-    K: Float[np.ndarray, "3 3"], p_cam_m: Float[np.ndarray, "n 3"], origin_m: Float[np.ndarray, "3"], length_m: float
+    K: Float[np.ndarray, "3 3"],
+    p_cam_m: Float[np.ndarray, "n 3"],
+    center_cam_m: Float[np.ndarray, "3"],
+    length_m: float,
 ) -> Float[np.ndarray, "n 2 6"]:
     """Jacobian of the projections of surface points with respect to the object's pose.
 
     Args:
         K: Camera matrix.
         p_cam_m: Points, camera frame, in front of the camera.
-        origin_m: The object's origin, camera frame.
+        center_cam_m: The object's centre, camera frame, where the pose has its origin.
         length_m: Unit of translation. The object's radius makes a step of 1 move the image about as far in rotation
             as in translation, so that one damping suits both.
 
@@ -33,8 +36,8 @@ def projection_jacobian(
         ],
         axis=1,
     )
-    # d(exp(w) q)/dw = -[q]x with q the point relative to the origin, and g . (w x q) = w . (q x g)
-    by_rotation = np.cross((p_cam_m - origin_m)[:, None], by_point)
+    # d(exp(w) q)/dw = -[q]x with q the point relative to the centre, and g . (w x q) = w . (q x g)
+    by_rotation = np.cross((p_cam_m - center_cam_m)[:, None], by_point)
     return np.concatenate([by_rotation, by_point * length_m], axis=-1)
 
 

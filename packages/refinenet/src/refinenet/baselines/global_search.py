@@ -14,7 +14,6 @@ this way in crowded rendered frames were wrong.
 """
 
 import dataclasses
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -40,7 +39,7 @@ DEFAULTS = SearchConfig()
 
 
 class GradientSearch(Baseline):
-    """`--method search`. Draws depend on the initial pose alone.
+    """`--method search`. Every pose of an object has the same draws.
 
     Args:
         meshes: Objects by id.
@@ -92,12 +91,12 @@ class GradientSearch(Baseline):
         self._simplified.close()
         super().close()
 
-    def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+    def _refine_all(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses in an image, each by itself.
 
         With predicted pose quality, failed poses are searched again behind the refined ones.
         """
-        results = super().refine_batch(frame, requests)
+        results = super()._refine_all(frame, requests)
         before = 0
         while self._has_quality and before < (count := sum(not r.failed for r in results)) < len(results):
             before = count
@@ -119,11 +118,11 @@ class GradientSearch(Baseline):
         Poses of the same object near the initial pose are left out: they may be the same instance, reached from another
         initial pose.
         """
-        mesh = self._meshes[request.obj_id]
+        mesh = self._frames.meshes[request.obj_id]
         initial_m = se3.apply(request.T_cam_obj, mesh.center_m[None])[0]
         occluders = []
         for other in refined:
-            centre_m = se3.apply(other.T_cam_obj, self._meshes[other.obj_id].center_m[None])[0]
+            centre_m = se3.apply(other.T_cam_obj, self._frames.meshes[other.obj_id].center_m[None])[0]
             across_m = np.linalg.norm(centre_m[:2] * initial_m[2] / centre_m[2] - initial_m[:2])
             if other.obj_id != request.obj_id or across_m > self._config.same_instance_distance * mesh.diameter_m:
                 occluders.append(Instance(obj_id=other.obj_id, T_cam_obj=other.T_cam_obj))
@@ -139,7 +138,7 @@ class GradientSearch(Baseline):
         if patch is None:
             return failed(T_cam_obj, 0, NOT_VISIBLE)
         model, simple = self._model(target), replace(target, rasteriser=self._simplified)
-        rng = np.random.default_rng([target.obj_id, zlib.crc32(initial.tobytes())])
+        rng = np.random.default_rng(target.obj_id)  # of the pose's digits, it would depend on where the origin lies
         poses = [initial, *search(patch, initial, target.mesh, model, rng, config)]
         by_edges = [self._by_edges(frame, T, simple, config.trial_iterations) for T in poses]
         candidates = self._by_network(frame, by_edges, simple)
@@ -186,9 +185,12 @@ class GradientSearch(Baseline):
         """
         if self._network is None:
             return list(poses)
-        requests = [Request(obj_id=target.obj_id, T_cam_obj=pose.T_cam_obj) for pose in poses]
+        requests = self._frames.own_requests(
+            [Request(obj_id=target.obj_id, T_cam_obj=pose.T_cam_obj) for pose in poses]
+        )
+        by_network = self._frames.results(self._network.refine_batch(frame, requests), requests)
         results = []
-        for before, after in zip(poses, self._network.refine_batch(frame, requests), strict=True):
+        for before, after in zip(poses, by_network, strict=True):
             similarity = 0.0 if after.failed else similarity_at(frame, after.T_cam_obj, target, self._config)
             score = (similarity + _confidence(after)) / 2 if self._has_quality else similarity
             best = after if (self._has_quality and not after.failed) or score > _confidence(before) else before

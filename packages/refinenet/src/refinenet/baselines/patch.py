@@ -27,7 +27,7 @@ class TrackedObject:
 
     Attributes:
         obj_id: Id of the mesh in the rasteriser.
-        mesh: Mesh, for its size.
+        mesh: Mesh, its origin at the centre.
         rasteriser: Holds the mesh.
         known_depth_m: Camera z of other objects with known poses, 0 elsewhere; None without any.
     """

@@ -91,7 +91,7 @@ def make_viewpoint_model(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> Vie
             near_m = np.where(mask, depth_m, cv2.dilate(depth_m, np.ones((3, 3), np.uint8)))
             pixels = np.argwhere(_ridge(direction, edge) & (near_m > 0))
             if len(pixels) == 0:  # no edge from this viewpoint, as of a sheet from its side: use the centre
-                pixels, near_m = np.full((1, 2), VIEW_PX // 2), np.full_like(near_m, T_cam_obj[2, 3])
+                pixels, near_m = np.full((1, 2), VIEW_PX // 2), np.full_like(near_m, mesh.center_cam_m(T_cam_obj)[2])
             row, column = pixels[rng.choice(len(pixels), POINTS, replace=len(pixels) < POINTS)].T
             z_m = near_m[row, column].astype(np.float64)
             p_cam_m = back_project(K, np.stack([column, row], axis=1) + 0.5, z_m)

@@ -10,6 +10,7 @@ from refinenet.config.train import (
     LossName,
     OnPolicyConfig,
     OptimiserConfig,
+    Pivot,
     PresetName,
     TrainConfig,
 )
@@ -26,6 +27,7 @@ __all__ = [
     "NetworkConfig",
     "OnPolicyConfig",
     "OptimiserConfig",
+    "Pivot",
     "PresetName",
     "TrainConfig",
     "ValidationConfig",

@@ -14,6 +14,7 @@ LossName = Literal["contour", "contour-forward", "mse", "point", "contour+point"
 ConfidenceTarget = Literal["visible_iou", "pose_quality"]
 DeviceName = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "bfloat16"]
+Pivot = Literal["center", "origin"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,6 +127,8 @@ class TrainConfig:
         init: checkpoint of the initial weights, of a network with the same settings; empty initialises at random.
         objects: ids of the dataset's objects to train on; empty takes all.
         category: the objects are members of a category; the network is meant for its other members, too.
+        pivot: point of an object that hypotheses and updates are about, and whose distance is learned: its `center`.
+            Earlier versions had its mesh's `origin`, and a run of theirs keeps it.
         threads: torch threads; 0 keeps torch's default.
         precision: precision of the convolutions in training; `auto` is bfloat16 on GPUs and on processors with bfloat16
             instructions, else float32. Poses, losses and weights are float32 always.
@@ -151,6 +154,7 @@ class TrainConfig:
     init: str = ""
     objects: tuple[int, ...] = ()
     category: bool = False
+    pivot: Pivot = "center"
     threads: Annotated[int, Range(0)] = 0
     precision: Precision = "auto"
     device: DeviceName = "auto"

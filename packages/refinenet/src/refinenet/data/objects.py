@@ -14,12 +14,21 @@ from posecore.shard import ShardReader
 from posecore.simplify import simplified
 from posecore.symmetry import ball_center_m, is_ball
 
+from refinenet.config import Pivot
+from refinenet.geometry.pivots import PivotFrames
 from refinenet.geometry.symmetry import ObjectPoints
 
 
 def object_ids(reader: ShardReader) -> list[int]:
     """Objects of the data card, sorted."""
     return sorted(int(key) for key in reader.card["objects"])
+
+
+def pivot_frames(meshes: Mapping[int, Mesh], pivot: Pivot) -> PivotFrames:
+    """Frames that poses are trained in: their origins are the configured pivots."""
+    if pivot == "center":
+        return PivotFrames.at_centers(meshes)
+    return PivotFrames.at(meshes, {obj_id: np.zeros(3) for obj_id in meshes})
 
 
 def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:
@@ -46,7 +55,7 @@ def load_models(reader: ShardReader) -> dict[int, ModelInfo]:
 def symmetries_of(
     meshes: Mapping[int, Mesh], models: Mapping[int, ModelInfo], step_deg: float
 ) -> dict[int, np.ndarray]:
-    """(s, 4, 4) symmetry transforms of each object, the identity first, by object id.
+    """(s, 4, 4) symmetry transforms of each object, the identity first, by object id, in the frames of `models`.
 
     Args:
         meshes: By object id.
@@ -69,7 +78,7 @@ def object_points(
 
     Args:
         meshes: By object id; rows follow the sorted ids.
-        models: Symmetries by object id; an object without an entry has none.
+        models: Symmetries by object id, in the meshes' frames; an object without an entry has none.
         n_points: Points of each object.
         step_deg: Step at which continuous symmetries are sampled.
     """

@@ -84,7 +84,8 @@ def draw_hypothesis(
 ) -> Float[np.ndarray, "4 4"]:
     """A pose near the ground truth: angle and distance uniform up to their limits, axis and direction uniform.
 
-    The translation along the ray from the camera to the object's origin is then scaled by `depth_stretch`.
+    It is rotated about its origin, which is the object's centre in training. The translation along the ray from the
+    camera to that point is then scaled by `depth_stretch`.
 
     Angle and distance are scaled down independently: after one update, a pose is well positioned in the image and still
     rotated, which is the input of a refinement's later iterations.
@@ -107,7 +108,7 @@ class OnlinePairMaker:
     """Maker of batches of online pairs from stored scenes.
 
     Args:
-        meshes: By object id.
+        meshes: By object id, their origins at the pivots of hypotheses and updates.
         rasteriser: Rasteriser with these meshes; made in the process that uses it.
         patch_px: Side of the new patches.
         window: Crop window.

@@ -20,7 +20,7 @@ from torch.utils.data import IterableDataset, get_worker_info
 from refinenet.batch import Batch, LossTarget, NetworkInput
 from refinenet.config import AugmentConfig, HypothesisConfig, TrainConfig
 from refinenet.data.growing_split import GrowingSplit
-from refinenet.data.objects import for_patches, load_models, symmetries_of
+from refinenet.data.objects import for_patches, load_models, pivot_frames, symmetries_of
 from refinenet.data.online_pairs import OnlinePairMaker, PairArrays
 from refinenet.data.precomputed_pairs import PRECOMPUTED_FIELDS, precomputed_pairs
 from refinenet.data.split import ORDER, SAMPLE, SHUFFLE, STAND_IN, Split
@@ -32,7 +32,12 @@ ONLINE_FIELDS = (
 
 
 class PairSource:
-    """Source of batches of tensors from rows of shards; opened in the process that uses it."""
+    """Source of batches of tensors from rows of shards; opened in the process that uses it.
+
+    Attributes:
+        reader: Dataset.
+        frames: Frames of the pivots, which poses in batches are of.
+    """
 
     def __init__(self, url: str, config: TrainConfig, *, training: bool) -> None:
         self.reader = ShardReader(url)
@@ -49,8 +54,10 @@ class PairSource:
         self._bad: dict[int, str] = {}
         self._unreported: list[str] = []
         self._rasteriser: Rasteriser | None = None
+        self.frames = pivot_frames(load_meshes(self.reader), config.pivot)
         if config.makes_pairs_online:
-            meshes = load_meshes(self.reader)
+            meshes = self.frames.meshes
+            models = self.frames.models(load_models(self.reader))
             self._rasteriser = Rasteriser(for_patches(meshes, config.network.patch_px))
             self._make = OnlinePairMaker(
                 meshes=meshes,
@@ -61,7 +68,7 @@ class PairSource:
                 contour_points=config.loss.contour_points,
                 hypothesis=config.hypothesis if training else _validation_hypotheses(config),
                 augment_config=self._augment,
-                symmetries=symmetries_of(meshes, load_models(self.reader), config.loss.symmetry_step_deg),
+                symmetries=symmetries_of(meshes, models, config.loss.symmetry_step_deg),
             )
 
     def close(self) -> None:
@@ -85,7 +92,7 @@ class PairSource:
         read: dict[int, dict[str, np.ndarray]] = {}
         for shard in shards:
             try:
-                read[shard] = self._cache.get(shard) or self.reader.read_checked(shard, fields)
+                read[shard] = self._cache.get(shard) or self._about_pivots(self.reader.read_checked(shard, fields))
             except ShardError as error:
                 if not self._config.loader.skip_bad_shards:
                     raise
@@ -119,6 +126,11 @@ class PairSource:
         batch = _tensors(arrays, [keys[i][1:] for i in arrays.kept], self._object_index)
         skipped, self._unreported = tuple(self._unreported), []
         return batch._replace(skipped=skipped)
+
+    def _about_pivots(self, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """A shard's arrays with poses of the pivots; shards hold poses of the objects' own origins."""
+        poses = ("T_cam_obj", "T_cam_obj_hypothesis")
+        return arrays | {name: self.frames.poses(arrays[name], arrays["obj_id"]) for name in poses}
 
 
 def _bytes(arrays: dict[str, np.ndarray]) -> int:

@@ -30,7 +30,7 @@ class Flow(NamedTuple):
 
 
 class PoseUpdate(NamedTuple):
-    """An update in camera axes about the object's origin: R' = dR R, t' = t + dt.
+    """An update in camera axes about the pose's origin, the object's pivot: R' = dR R, t' = t + dt.
 
     Attributes:
         dR: (b, 3, 3) rotations.
@@ -135,10 +135,10 @@ def crop_update(
     K_crop: Float[Tensor, "b 3 3"],
     patch_px: int,
 ) -> PoseUpdate:
-    """Convert an update in crop coordinates to camera axes about the object's origin.
+    """Convert an update in crop coordinates to camera axes about the pose's origin, the object's pivot.
 
     The rotation is given in axes aligned with the ray through the crop's centre: the same crop then has the same
-    output wherever it lies in the image. Translation, in units of the patch: the projection of the object's
+    output wherever it lies in the image. Translation, in units of the patch: the projection of the
     origin moves by v_xy, and log z grows by v_z patch_px / f_crop. So scaled, one unit of v_z moves the object as far
     in metres as one unit of v_x, for any focal length; log z itself would be a tenth as large as xy and learnt late.
 

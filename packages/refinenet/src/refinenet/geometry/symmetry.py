@@ -48,7 +48,7 @@ def nearest_by_rotation(
 ) -> Float[Tensor, "b 4 4"]:
     """The symmetry-equivalent ground truth whose rotation is nearest to a pose's.
 
-    A symmetry whose axis misses the object's origin translates the origin, too. The sample nearest by the mean L1
+    A symmetry whose axis misses the pose's origin translates the origin, too. The sample nearest by the mean L1
     distance of rotated points is rotated about the object's axes to the least squared distance. So an exact pose is its
     own nearest pose, whichever equivalent pose is annotated as ground truth.
 

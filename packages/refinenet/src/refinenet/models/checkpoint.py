@@ -28,7 +28,9 @@ from refinenet.models.heads import forms
 from refinenet.models.migration import migrated_config
 from refinenet.models.networks import make_network
 
-FORMAT, VERSION = "refinenet", "1"
+FORMAT, VERSION = "refinenet", "2"
+VERSIONS = ("1", VERSION)
+"""Versions that are read; updates of version 1 are about the mesh's origin, see `migration.migrated_config`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,12 +150,14 @@ def load(path: Path, preset: str | None = None) -> Checkpoint:
         raise CheckpointError(f"{path}: no such checkpoint; train one with `refinenet train`") from error
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: no readable safetensors file ({error}); choose another checkpoint") from error
-    header = (metadata.get("format"), metadata.get("version"))
-    if header != (FORMAT, VERSION):
-        raise CheckpointError(f"{path}: format {header[0]} version {header[1]}, expected {FORMAT} version {VERSION}")
+    kind, version = metadata.get("format"), metadata.get("version", "")
+    if kind != FORMAT or version not in VERSIONS:
+        raise CheckpointError(
+            f"{path}: format {kind} version {version}, expected {FORMAT} version {' or '.join(VERSIONS)}"
+        )
     stored = parsed_metadata(metadata, path)
     try:
-        config = posecore_config.build(TrainConfig, migrated_config(stored["config"]), f"{path}: config")
+        config = posecore_config.build(TrainConfig, migrated_config(stored["config"], version), f"{path}: config")
     except ConfigError as error:
         raise CheckpointError(f"{error}; the metadata is damaged or of another version") from error
     provenance = Provenance(**{**stored, "config": config})

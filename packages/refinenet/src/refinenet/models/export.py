@@ -43,7 +43,7 @@ class FlatNetwork(nn.Module):
         self, scene_rgb: Tensor, hypothesis_rgb: Tensor, T_cam_obj: Tensor, K_crop: Tensor,
         hypothesis_depth_m: Tensor | None = None,
     ) -> tuple[Tensor, ...]:  # fmt: skip
-        """The update of each pair, in camera axes about the object's origin."""
+        """The update of each pair, in camera axes about the pivot, which `T_cam_obj` is a pose of."""
         update = self.network(NetworkInput(scene_rgb, hypothesis_rgb, T_cam_obj, K_crop, hypothesis_depth_m))
         return (update.dR, update.dt) if update.confidence is None else (update.dR, update.dt, update.confidence)
 
@@ -51,7 +51,8 @@ class FlatNetwork(nn.Module):
 def export(loaded: Checkpoint, out: Path) -> dict[str, float]:
     """Write a network as ONNX (`.onnx`) or as a torch.export program (`.pt2`), of any batch size, and check the file.
 
-    The file has metadata `refinenet` (JSON) for its user: patch, window, objects, checkpoint hash.
+    The file has metadata `refinenet` (JSON) for its user: patch, window, pivot, objects, checkpoint hash. Input
+    `T_cam_obj` is the pose of the pivot (`se3.with_origin_at`): the object's centre, or its mesh's origin.
 
     Args:
         loaded: Checkpoint.
@@ -174,6 +175,7 @@ def _about(loaded: Checkpoint) -> dict[str, Any]:
         "step": provenance.step,
         "patch_px": provenance.config.network.patch_px,
         "window": posecore_config.to_dict(provenance.config)["window"],
+        "pivot": provenance.config.pivot,
         "objects": provenance.objects,
         "camera_fx_px": provenance.camera_fx_px,
         "checkpoint_sha256": loaded.sha256,

@@ -39,7 +39,7 @@ def pose_update(
     crop: bool,
     confidence: Float[Tensor, "b 1"] | None = None,
 ) -> PoseUpdate:
-    """The pose update of head outputs, in camera axes about the object's origin.
+    """The pose update of head outputs, in camera axes about the pose's origin.
 
     Args:
         rotation: 6D representation or quaternion, by its length.

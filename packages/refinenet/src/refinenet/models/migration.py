@@ -16,9 +16,9 @@ RECORD_KEYS = {"held_out_scenes": "validation_scenes"}
 METRIC_KEYS = {"visible_share": "visible_fraction", "data_wait_share": "data_wait_fraction"}
 
 
-def migrated_config(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The configuration in a checkpoint's metadata."""
-    return migrated_keys(config, RENAMED)
+def migrated_config(config: Mapping[str, Any], version: str) -> dict[str, Any]:
+    """The configuration in the metadata of a checkpoint of a format version; version 1 had the origin as its pivot."""
+    return migrated_keys(config, RENAMED) | ({"pivot": "origin"} if version == "1" else {})
 
 
 def migrated_state(state: Mapping[str, Any]) -> dict[str, Any]:

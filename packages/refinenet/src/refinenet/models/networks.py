@@ -37,7 +37,7 @@ class _Branch(nn.Module):
 class PaperNet(nn.Module):
     """The 2018 design: both 224 px patches through one frozen stem, then Inception-A blocks and two branches.
 
-    Output: a quaternion and a translation in metres, both in camera axes about the object's origin, unless the config
+    Output: a quaternion and a translation in metres, both in camera axes about the pose's origin, unless the config
     asks for others. Heads start at the identity. Left open by the paper and settled here: 384 channels in the strided
     convolution beside the pooling, `config.branch_channels` before the heads, batch norm in the trained blocks.
 

@@ -1,5 +1,10 @@
 """Checks of a mesh before refinement: the trained object, in the trained unit."""
 
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 from posecore.errors import CheckpointError
 from posecore.mesh import Mesh, mesh_digest
 
@@ -45,14 +50,35 @@ def require_trained(loaded: Checkpoint, obj_id: int, mesh: Mesh, *, allow_other_
             f"{loaded.path}: object {obj_id} had a diameter of {1e3 * trained_m:.1f} mm in training, this one has "
             f"{1e3 * mesh.diameter_m:.6g} mm: {reason}"
         )
-    if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
-        return
-    if "mesh_digest" in trained and mesh_digest(mesh) != trained["mesh_digest"] and not allow_other_mesh:
+    if not allow_other_mesh and not _is_trained_mesh(trained, mesh):
         raise CheckpointError(
             f"{loaded.path}: object {obj_id} is another mesh than in training ({mesh.path or 'this one'} has digest "
             f"{mesh_digest(mesh)[:12]}, {trained.get('name', 'the trained one')} had {trained['mesh_digest'][:12]}); "
             "give the mesh it was trained with, or pass --allow-other-mesh"
         )
+
+
+def pivots_m(loaded: Checkpoint, meshes: Mapping[int, Mesh]) -> dict[int, Float[np.ndarray, "3"]]:
+    """Point of each object, in its own frame, that a checkpoint's updates are about: the centre, metres.
+
+    A checkpoint of an earlier version learned updates about the origin of the mesh that it was trained on, and has it
+    there. Another mesh's origin, accepted with --allow-other-mesh, may lie anywhere: it has its centre. Where an update
+    is small, both give the same pose. The members of a category share their frame, and have their origin.
+    """
+    config, objects = loaded.provenance.config, loaded.provenance.objects
+    return {
+        obj_id: np.zeros(3)
+        if config.pivot == "origin" and (config.category or _is_trained_mesh(objects[str(obj_id)], mesh))
+        else mesh.center_m
+        for obj_id, mesh in meshes.items()
+    }
+
+
+def _is_trained_mesh(trained: Mapping[str, Any], mesh: Mesh) -> bool:
+    """Whether the hash of the file or `mesh_digest` is that of training; without `mesh_digest` any mesh is."""
+    if mesh.sha256 and mesh.sha256 == trained.get("sha256"):
+        return True
+    return "mesh_digest" not in trained or mesh_digest(mesh) == trained["mesh_digest"]
 
 
 def _require_member(loaded: Checkpoint, obj_id: int, mesh: Mesh) -> None:

@@ -1,12 +1,13 @@
 """Multi-hypothesis refinement: several poses around an initial pose are ranked against the image, then refined."""
 
 import math
-import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
+from posecore import se3
 from posecore.errors import ConfigError
+from posecore.mesh import Mesh
 
 from refinenet.data.online_pairs import draw_hypothesis
 from refinenet.refine.network_refiner import Refiner
@@ -19,10 +20,10 @@ KEPT_FRACTION = 0.25
 class MultiHypothesisRefiner:
     """Refines the best hypotheses of a set around each initial pose: a `PoseRefiner`.
 
-    A hypothesis set is the initial pose and poses drawn around it, rotated and shifted across the image by as much as
-    the network was trained to correct. All keep the initial depth, which edges hardly show. The set is ranked before
-    refinement, its best quarter is refined, and the most confident result is returned. With scorer `none` the whole set
-    is refined. Draws depend on the seed and the initial pose alone.
+    A hypothesis set is the initial pose and poses drawn around it, rotated about the object's centre and shifted across
+    the image by as much as the network was trained to correct. All keep the centre's depth, which edges hardly show.
+    The set is ranked before refinement, its best quarter is refined, and the most confident result is returned. With
+    scorer `none` the whole set is refined. With a seed, every pose of an object has the same draws.
 
     Args:
         refiner: Network; closed with this object.
@@ -60,6 +61,11 @@ class MultiHypothesisRefiner:
         return self._refiner.corrects_depth
 
     @property
+    def meshes(self) -> Mapping[int, Mesh]:
+        """The network's meshes."""
+        return self._refiner.meshes
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Settings for the sidecar."""
         hypothesis_set = {"hypotheses": self._hypotheses, "scorer": self._scorer, "seed": self._seed}
@@ -81,13 +87,15 @@ class MultiHypothesisRefiner:
         ]
 
     def _hypothesis_set(self, request: Request) -> list[Request]:
-        pose = np.ascontiguousarray(request.T_cam_obj, np.float64)
-        rng = np.random.default_rng([self._seed, request.obj_id, zlib.crc32(pose.tobytes())])
+        # Of the pose's digits, the draws would depend on where its origin lies.
+        rng = np.random.default_rng([self._seed, request.obj_id])
         config = self._refiner.checkpoint.provenance.config.hypothesis
-        diameter_m = self._refiner.meshes[request.obj_id].diameter_m
-        drawn = [draw_hypothesis(pose, diameter_m, config, rng) for _ in range(self._hypotheses - 1)]
+        mesh = self._refiner.meshes[request.obj_id]
+        T_cam_center = se3.with_origin_at(np.asarray(request.T_cam_obj, np.float64), mesh.center_m)
+        drawn = [draw_hypothesis(T_cam_center, mesh.diameter_m, config, rng) for _ in range(self._hypotheses - 1)]
         for T in drawn:
-            T[:3, 3] *= pose[2, 3] / T[2, 3]  # along the ray, back to the initial depth
+            T[:3, 3] *= T_cam_center[2, 3] / T[2, 3]  # along the ray, back to the initial depth
+        drawn = [se3.with_origin_at(T, -mesh.center_m) for T in drawn]
         return [request, *(Request(obj_id=request.obj_id, T_cam_obj=T) for T in drawn)]
 
     def _best(

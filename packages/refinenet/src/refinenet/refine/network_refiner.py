@@ -17,11 +17,12 @@ from posecore.mesh import Mesh
 from refinenet.batch import NetworkInput
 from refinenet.device import choose_device
 from refinenet.errors import RefinementError
+from refinenet.geometry.pivots import PivotFrames
 from refinenet.geometry.poses import PoseUpdate
 from refinenet.image.edge_gradients import gradient_similarity
 from refinenet.models import checkpoint
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.refine.input_checks import require_trained
+from refinenet.refine.input_checks import pivots_m, require_trained
 from refinenet.refine.patches import Patches, PatchRenderer
 from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, require_meshes
 
@@ -61,8 +62,9 @@ class Refiner:
 
     Attributes:
         checkpoint: Checkpoint.
-        meshes: Objects by id.
-        patch_renderer: Renders and crops the patches.
+        meshes: Objects by id, as given.
+        frames: Frames of the checkpoint's pivots, in which poses are updated.
+        patch_renderer: Renders and crops the patches, of poses in `frames`.
         device: Device of the network.
         scorer: Source of confidences: `learned` where the network has a confidence output, else `gradient`.
 
@@ -91,14 +93,15 @@ class Refiner:
         for obj_id, mesh in sorted(meshes.items()):
             require_trained(loaded, obj_id, mesh, allow_other_mesh=allow_other_mesh)
         self.checkpoint = loaded
-        self.meshes = dict(meshes)
+        self.meshes: Mapping[int, Mesh] = dict(meshes)
+        self.frames = PivotFrames.at(meshes, pivots_m(loaded, meshes))
         self._iterations = iterations
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
         self._uses_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
-        self.patch_renderer = PatchRenderer(meshes, loaded.provenance)
+        self.patch_renderer = PatchRenderer(self.frames.meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
 
     @classmethod
@@ -178,6 +181,10 @@ class Refiner:
     def refine_batch(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
         """Refine poses of any objects in an image together; see `refine` for errors."""
         require_meshes(requests, self.meshes)
+        return self.frames.own_results(self._refine_all(frame, self.frames.requests(requests)), requests)
+
+    def _refine_all(self, frame: Frame, requests: Sequence[Request]) -> list[Refinement]:
+        """Refine poses of the pivots."""
         b = len(requests)
         batch = _Batch(
             T=_poses(requests), obj_id=_objects(requests), converged=np.zeros(b, bool),
@@ -197,7 +204,7 @@ class Refiner:
             batch.failures[row] = reason and f"after {batch.iterations[row]} updates {reason}"
         return [
             Refinement(
-                T_cam_obj=np.asarray(request.T_cam_obj, np.float64) if reason else batch.T[i],
+                T_cam_obj=request.T_cam_obj if reason else batch.T[i],
                 status=Status.FAILED if reason else Status.CONVERGED if batch.converged[i] else Status.STOPPED,
                 iterations=int(batch.iterations[i]),
                 confidence=0.0 if reason else confidences[i],
@@ -222,7 +229,7 @@ class Refiner:
             ConfigError: An object has no mesh here.
         """
         require_meshes(requests, self.meshes)
-        return self._score(frame, _poses(requests), _objects(requests), scorer)[0]
+        return self._score(frame, _poses(self.frames.requests(requests)), _objects(requests), scorer)[0]
 
     def _update(self, frame: Frame, batch: _Batch, rows: Int[np.ndarray, " a"]) -> None:
         """Update these rows once."""
@@ -239,7 +246,7 @@ class Refiner:
     def updated(
         self, patches: Patches, T: Float[np.ndarray, "s 4 4"]
     ) -> tuple[Float[np.ndarray, "s 4 4"], Bool[np.ndarray, " s"]]:
-        """Updated poses, and a mask of the poses whose update was small."""
+        """Updated poses of the pivots, and a mask of the poses whose update was small."""
         update = self.predict(patches, T)
         # float32 products drift from orthonormal over many iterations, so each update is made a rotation again.
         dR, dt_m = se3.nearest_rotation(update.dR.double().cpu().numpy()), update.dt.double().cpu().numpy()
@@ -272,7 +279,7 @@ class Refiner:
         return gradient_similarity(patches.scene_rgb, patches.hypothesis_rgb, patches.mask, patches.inside)
 
     def predict(self, patches: Patches, T: Float[np.ndarray, "s 4 4"]) -> PoseUpdate:
-        """The network's update for these patches, in as many passes as the memory requires."""
+        """The network's update for these patches and poses of the pivots, in as many passes as the memory requires."""
         requested = self._batch
         while True:
             try:

@@ -88,10 +88,10 @@ class PatchRenderer:
             rgb[drawable], depth_m[drawable] = layers.rgb, layers.depth_m
         for row, window in windows.items():
             inside[row] = pixels_inside(window, p, width_px, height_px)
+            centre_m = self._meshes[int(obj_id[row])].center_cam_m(T_cam_obj[row])
             if not (depth_m[row] > 0).any():
-                failures[row] = f"its render at {T_cam_obj[row, 2, 3]:.3g} m covers no pixel"
+                failures[row] = f"its render at {centre_m[2]:.3g} m covers no pixel"
             elif not ((depth_m[row] > 0) & inside[row]).any():
-                centre_m = self._meshes[int(obj_id[row])].center_cam_m(T_cam_obj[row])
                 u, v = project(frame.K, centre_m[None])[0]
                 failures[row] = f"it lies at ({u:.0f}, {v:.0f}) px, outside the image of {width_px} x {height_px} px"
         visible = np.array([row for row in range(b) if failures[row] is None], np.int64)

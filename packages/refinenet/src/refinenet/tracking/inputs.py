@@ -68,10 +68,11 @@ def read_poses(file: Path) -> list[tuple[int, Pose]]:
         ConfigError: The translations are in metres.
     """
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
-    nearest_m = min((abs(float(pose.T_cam_obj[2, 3])) for pose in poses), default=SUSPICIOUS_M)
+    # The length, not t_z: an origin off the object may lie beside the camera.
+    nearest_m = min((float(np.linalg.norm(pose.T_cam_obj[:3, 3])) for pose in poses), default=SUSPICIOUS_M)
     if nearest_m < SUSPICIOUS_M:
         raise ConfigError(
-            f"{file}: a t_z of {1e3 * nearest_m:.4g} is probably in metres; "
+            f"{file}: a t of length {1e3 * nearest_m:.4g} is probably in metres; "
             "cam_t_m2c is in millimetres, multiply it by 1000"
         )
     return [(pose.obj_id, pose.T_cam_obj) for pose in poses]

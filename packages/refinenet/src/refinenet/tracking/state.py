@@ -85,7 +85,7 @@ def next_status(status: TrackStatus, confidence: float | None, config: TrackingC
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """An accepted pose and its frame number."""
+    """An accepted pose, of the object's centre, and its frame number."""
 
     frame: int
     T_cam_obj: Float[np.ndarray, "4 4"]
@@ -94,7 +94,7 @@ class Observation:
 def predicted(before: Observation, last: Observation, frame: int) -> Float[np.ndarray, "4 4"]:
     """Pose in a frame, extrapolated from two observations at constant velocity.
 
-    The velocity is constant in camera axes about the object's origin, as pose updates are. The extrapolation is no
+    The velocity is constant in camera axes about the object's centre, as pose updates are. The extrapolation is no
     longer than the time between the observations: after a longer gap the motion has probably changed.
     """
     dR, dt_m = se3.update_between(before.T_cam_obj, last.T_cam_obj)
@@ -105,7 +105,10 @@ def predicted(before: Observation, last: Observation, frame: int) -> Float[np.nd
 
 
 def at_depths(T_cam_obj: Float[np.ndarray, "4 4"], step: float) -> list[Float[np.ndarray, "4 4"]]:
-    """A pose, then its copies shifted along the ray by a fraction of its depth, nearer and farther; none at step 0."""
+    """A pose, then its copies shifted along its origin's ray by a fraction of the depth, nearer and farther.
+
+    No copies at step 0. The origin has to be the object's centre.
+    """
     poses = []
     for factor in (1.0, 1.0 - step, 1.0 + step) if step else (1.0,):
         T = T_cam_obj.copy()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
+from posecore import se3
 from posecore.symmetry import Symmetric, nearest_symmetric
 
 from refinenet.refiner import Frame, PoseRefiner, Refinement, Request, ScoreKind
@@ -63,6 +64,7 @@ class ObjectTrack:
     Attributes:
         obj_id: Object.
         config: Thresholds.
+        center_m: Centre of the object, in its own frame.
         symmetries: Symmetries of the object; None without.
         motion_model: Whether the next pose is predicted at constant velocity, instead of equal to the last.
         status: State.
@@ -70,6 +72,7 @@ class ObjectTrack:
 
     obj_id: int
     config: TrackingConfig
+    center_m: Float[np.ndarray, "3"]
     symmetries: Symmetric | None = None
     motion_model: bool = False
     status: TrackStatus = field(default_factory=lambda: TrackStatus(state=TrackState.LOST))
@@ -88,7 +91,8 @@ class ObjectTrack:
             poses.insert(0, predicted(self._observations[0], self._observations[-1], frame))
             if self.status.state is TrackState.TRACKING:
                 poses = poses[:1]
-        poses = [shifted for T in poses for shifted in at_depths(T, self.config.depth_step)]
+        shifted = [copy for T in poses for copy in at_depths(T, self.config.depth_step)]
+        poses = [se3.with_origin_at(T, -self.center_m) for T in shifted]
         self._continued = len(poses)
         if self.status.state is TrackState.LOST:
             poses += list(initial)
@@ -113,7 +117,8 @@ class ObjectTrack:
         # Across a gap there is no velocity: the motion in between is unknown.
         continues = bool(self._observations) and not restarted and not gap
         before = self._observations[1 - VELOCITY_OBSERVATIONS :] if continues else []
-        self._observations = [*before, Observation(frame=frame, T_cam_obj=pose)]
+        of_center = Observation(frame=frame, T_cam_obj=se3.with_origin_at(pose, self.center_m))
+        self._observations = [*before, of_center]
         return Tracked(
             obj_id=self.obj_id, state=self.status.state, T_cam_obj=pose, confidence=confidence, restarted=restarted
         )
@@ -152,7 +157,7 @@ class Tracker:
 
     Args:
         refiner: Method; not closed.
-        obj_ids: Objects.
+        obj_ids: Objects; the method has their meshes.
         config: Thresholds; `default_config` by default.
         symmetries: Symmetries by object id, of the symmetric objects.
         motion_model: Whether poses are predicted at constant velocity.
@@ -174,7 +179,13 @@ class Tracker:
         symmetric = symmetries or {}
         config = config or default_config(refiner)
         self._tracks = [
-            ObjectTrack(obj_id=i, config=config, symmetries=symmetric.get(i), motion_model=motion_model)
+            ObjectTrack(
+                obj_id=i,
+                config=config,
+                center_m=refiner.meshes[i].center_m,
+                symmetries=symmetric.get(i),
+                motion_model=motion_model,
+            )
             for i in sorted(set(obj_ids))
         ]
 

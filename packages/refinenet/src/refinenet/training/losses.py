@@ -40,7 +40,7 @@ def sample_distance(distance_px: Float[Tensor, "b p p"], uv_px: Float[Tensor, "b
 def forward_contour_loss_px(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b"]:
     """Mean scene distance of the hypothesis' contour points after the update, projected; patch pixels.
 
-    Source: Manhardt et al., Deep Model-Based 6D Pose Refinement in RGB, ECCV 2018, Eq. 3, about the object's origin.
+    Source: Manhardt et al., Deep Model-Based 6D Pose Refinement in RGB, ECCV 2018, Eq. 3, about the pivot.
     """
     t = target.T_cam_obj_hypothesis[:, None, :3, 3]
     updated_m = (target.hypothesis_contour_m - t) @ update.dR.transpose(1, 2) + t + update.dt[:, None]
@@ -55,7 +55,7 @@ def contour_loss_px(update: PoseUpdate, target: LossTarget) -> Float[Tensor, " b
     object's rim: a residual of about (1 - cos theta) times the silhouette's radius stays, 0.4 px at 15 degrees on a
     64 px patch.
 
-    Source: ECCV 2018 paper, Eq. 3 and 4, about the object's origin.
+    Source: ECCV 2018 paper, Eq. 3 and 4, about the pivot.
     """
     t = target.T_cam_obj[:, None, :3, 3]
     reverted_m = (target.scene_contour_m - t) @ update.dR + t - update.dt[:, None]
@@ -78,7 +78,7 @@ def point_loss_px(
 
     Each term is the mean L1 distance of model points, in metres times f_crop / z: patch pixels, comparable with the
     contour loss. The ground truth is the symmetry-equivalent pose of the nearest rotation; a symmetry whose axis misses
-    the object's origin translates the origin, too.
+    the pivot translates the pivot, too.
 
     Source: Labbe et al., CosyPose, ECCV 2020, and Simonelli et al., Disentangling Monocular 3D Object Detection.
     """

@@ -35,7 +35,7 @@ class SavedRun:
 
 
 def load_run(config: TrainConfig, out: Path) -> SavedRun:
-    """The run in a folder.
+    """The run in a folder; one that an earlier version began keeps its pivot.
 
     Raises:
         ConfigError: A setting differs from the run's.
@@ -43,6 +43,8 @@ def load_run(config: TrainConfig, out: Path) -> SavedRun:
     """
     last = checkpoint.load(out / "last.safetensors", config.preset)
     before = last.provenance.config
+    if before.pivot == "origin":
+        config = replace(config, pivot=before.pivot)
     checkpoint.require_same(before, config, last.path)
     if config.optimiser.schedule == "cosine" and before.steps != config.steps:
         rates = [learning_rate(last.provenance.step, c.steps, c.optimiser) for c in (before, config)]

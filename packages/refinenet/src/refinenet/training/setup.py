@@ -1,5 +1,6 @@
 """Assembly of a training run from its configuration."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -37,6 +38,8 @@ def open_run(config: TrainConfig, url: str, out: Path, *, resume: bool = False) 
     torch.backends.cudnn.deterministic, torch.backends.cudnn.benchmark = True, False
     ranks, device = Ranks.of_environment(), choose_device(config.device)
     saved = load_run(config, out) if resume else None
+    if saved is not None:
+        config = replace(config, pivot=saved.last.provenance.config.pivot)
     joined = saved.validation_shards if saved else ()
     data = open_data(config, url, out, ranks, resume=resume, validation_shards=joined)
     network = build_network(config, device, pretrained=saved is None)

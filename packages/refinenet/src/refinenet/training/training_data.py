@@ -14,7 +14,7 @@ from posecore.shard import ShardReader, load_meshes, n_shards
 
 from refinenet.config import TrainConfig
 from refinenet.data.growing_split import GrowingSplit, wait_for_dataset, wait_for_start
-from refinenet.data.objects import load_models, object_ids, object_points
+from refinenet.data.objects import load_models, object_ids, object_points, pivot_frames
 from refinenet.data.split import DataRecord, Split, choose_validation_scenes, divide, read_scenes
 from refinenet.data.validation_set import ValidationSet
 from refinenet.geometry.symmetry import ObjectPoints
@@ -32,8 +32,8 @@ class TrainingData:
         training: Rows to train on.
         growing: Source of new shards between epochs; None for a complete dataset.
         validation: Validation pairs; None on ranks other than 0.
-        meshes: By object id.
-        points: Model points and symmetries, on the CPU.
+        meshes: By object id, in frames with the pivots as origins, as the pairs' poses.
+        points: Model points and symmetries in the same frames, on the CPU.
         sha256: Hash of the dataset.
         objects_card: By object id as text: card of each object that is trained on.
         camera_fx_px: Focal length of the training camera; 0 where unknown.
@@ -93,13 +93,16 @@ def open_data(
     training, validation, record = _split(reader, config, out, ranks, skipped, resume=resume)
     growing = GrowingSplit(out=out, record=record, config=config) if config.loader.follow else None
     meshes = load_meshes(reader)
+    frames = pivot_frames(meshes, config.pivot)
     data = TrainingData(
         url=url,
         training=training,
         growing=growing,
         validation=ValidationSet(url, config, validation, growing, validation_shards) if ranks.rank == 0 else None,
-        meshes=meshes,
-        points=object_points(meshes, load_models(reader), config.loss.model_points, config.loss.symmetry_step_deg),
+        meshes=frames.meshes,
+        points=object_points(
+            frames.meshes, frames.models(load_models(reader)), config.loss.model_points, config.loss.symmetry_step_deg
+        ),
         sha256=_dataset_sha256(reader, config),
         objects_card={
             key: {**card, "mesh_digest": mesh_digest(meshes[int(key)])}

@@ -19,7 +19,7 @@ def pose_errors(
     object_index: Tensor,
     objects: ObjectPoints,
 ) -> dict[str, Float[Tensor, " b"]]:
-    """Errors of each pose: rotation_deg, x_mm, y_mm, z_mm (absolute), add_mm (mean point distance).
+    """Errors of each pose: rotation_deg, x_mm, y_mm, z_mm (absolute, of the pivot), add_mm (mean point distance).
 
     The ground truth is its nearest symmetry-equivalent pose: by angle for the rotation, by points for the others.
     """

@@ -68,11 +68,7 @@ def point_at_pixel(camera: Camera, position: Float[np.ndarray, "2"], z_m: float)
 def draw_hypothesis(
     rng: np.random.Generator, config: PerturbationConfig, T_cam_obj: Float[np.ndarray, "4 4"], mesh: Mesh
 ) -> Float[np.ndarray, "4 4"]:
-    """Perturb a true pose: rotate it about the object's box centre and translate it.
-
-    The pivot is the box centre and not the origin, because a mesh whose origin is far off its surface would leave the
-    window. For a mesh centred on its origin the two are the same.
-    """
+    """Perturb a true pose: rotate it about the object's centre and translate it."""
     ease = config.easy_scale if rng.random() < config.easy_fraction else 1.0
     angle = math.radians(config.max_angle_deg) * ease * rng.uniform()
     length_m = config.max_translation_diameter * mesh.diameter_m * ease * rng.uniform()

@@ -40,13 +40,16 @@ def find_stable_poses(mesh: Mesh) -> StablePoses:
 
     Source: Goldberg et al., "Part pose statistics: estimators and experiments", 1999 (the quasi-static estimator).
     """
+    center_m = mesh.center_m
+    mesh = mesh.with_origin_at(center_m)  # planes are rounded: about the centre, equally wherever the origin lies
     scale = max(mesh.diameter_m, 1e-12)
     try:
         points = mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices]
         hull = ConvexHull(_extreme(points) if len(points) > _MAX_HULL_POINTS else points)
     except QhullError:
         _, _, axes = np.linalg.svd(mesh.vertices_m - mesh.vertices_m.mean(axis=0), full_matrices=False)
-        return StablePoses(hull_m=mesh.vertices_m, down=np.stack([axes[2], -axes[2]]), weights=np.array([0.5, 0.5]))
+        hull_m = mesh.vertices_m + center_m
+        return StablePoses(hull_m=hull_m, down=np.stack([axes[2], -axes[2]]), weights=np.array([0.5, 0.5]))
     planes = np.unique((hull.equations / [1, 1, 1, scale] / _TOLERANCE).round() * _TOLERANCE, axis=0) * [1, 1, 1, scale]
     normals = planes[:, :3] / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
     height = np.maximum(-planes[:, 3] - normals @ _centre_of_mass(mesh, hull), 1e-9 * scale)
@@ -60,7 +63,7 @@ def find_stable_poses(mesh: Mesh) -> StablePoses:
             break
         landed = onward
     facets, counts = np.unique(landed, return_counts=True)
-    return StablePoses(hull_m=points, down=normals[facets], weights=counts / counts.sum())
+    return StablePoses(hull_m=points + center_m, down=normals[facets], weights=counts / counts.sum())
 
 
 class StablePosesByKey(dict[int, StablePoses]):

@@ -110,7 +110,7 @@ def make_target(obj_id: int, mesh: Mesh, config: SynthConfig, assets: Assets | N
 def hull(mesh: Mesh) -> Float[np.ndarray, "h 3"]:
     """Vertices of the convex hull; all vertices of a flat object, whose hull has no volume."""
     try:
-        return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m).vertices])
+        return np.asarray(mesh.vertices_m[ConvexHull(mesh.vertices_m - mesh.center_m).vertices])
     except QhullError:
         return mesh.vertices_m
 

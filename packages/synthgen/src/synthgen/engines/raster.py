@@ -18,7 +18,7 @@ from synthgen.engine import RenderedScene
 from synthgen.image import pattern
 from synthgen.image.hdri import with_lamps
 from synthgen.image.sensor import linear_from_display
-from synthgen.scene import Light, Material, Scene, Vector
+from synthgen.scene import Light, Material, Scene, Vector, with_origins_at
 
 _SUPERSAMPLING = 2
 _WHITE_KEY = -1_000_000_000  # key of a mesh's white copy, drawn where a material replaces its colours
@@ -30,23 +30,25 @@ class RasterEngine:
     name = "raster"
 
     def __init__(self) -> None:
-        self._meshes: dict[int, Mesh] = {}
+        self._centers_m: dict[int, Float[np.ndarray, "3"]] = {}
         self._rasteriser: Rasteriser | None = None
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Load meshes under their keys."""
+        """Load meshes under their keys; patterns and light are about their centres."""
         if self._rasteriser is None:
             self._rasteriser = Rasteriser({})
         for key, mesh in meshes.items():
-            self._meshes[key] = mesh
-            self._rasteriser.add(key, mesh)
+            self._centers_m[key] = mesh.center_m
+            centred = mesh.with_origin_at(mesh.center_m)
+            self._rasteriser.add(key, centred)
             white = np.full((len(mesh.vertices_m), 3), 255, np.uint8)
-            self._rasteriser.add(_WHITE_KEY + key, replace(mesh, vertex_rgb=white, uv=None, texture_rgb=None))
+            self._rasteriser.add(_WHITE_KEY + key, replace(centred, vertex_rgb=white, uv=None, texture_rgb=None))
 
     def render(self, scene: Scene) -> RenderedScene:
         """Render `scene.region_px`: colour with 2 x 2 samples per pixel, depth and index at the pixel centres."""
         if self._rasteriser is None:
             raise RenderError("the raster engine has no meshes; call load first")
+        scene = replace(scene, objects=with_origins_at(scene.objects, self._centers_m))
         x0, y0, width, height = scene.region_px
         instances = [
             Instance(

@@ -13,7 +13,8 @@ from posecore.camera import project
 from posecore.contour import contour_mask
 from posecore.errors import ConfigError, ShardError
 from posecore.files import write_atomic
-from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader
+from posecore.mesh import Mesh
+from posecore.shard import BIT_FOREGROUND, BIT_OBJECT, BIT_VISIBLE, ShardReader, load_meshes
 
 from synthgen.inputs.sources import diameter_text
 
@@ -51,11 +52,12 @@ def contact_sheet(url: str, count: int, *, first: int | None = None) -> Image:
         raise ShardError(
             f"{url}: no rendered sample from {first or 0} on; {len(rendered)} of {reader.n} samples are rendered"
         )
+    meshes = load_meshes(reader)
     rows = []
     for shard_id, shown in groupby(indices, key=lambda i: i // reader.shard_size):
         samples = reader.read_checked(shard_id)
         start = shard_id * reader.shard_size
-        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i) for i in shown]
+        rows += [sample_row({k: v[i - start] for k, v in samples.items()}, i, meshes) for i in shown]
     return np.concatenate([title_row(), *rows])
 
 
@@ -116,8 +118,8 @@ def save_contact_sheet(
     return sheet.shape[1], sheet.shape[0]
 
 
-def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
-    """Row of a contact sheet from the fields of a sample."""
+def sample_row(sample: Mapping[str, np.ndarray], index: int, meshes: Mapping[int, Mesh]) -> Image:
+    """Row of a contact sheet from the fields of a sample and the dataset's meshes by object id."""
     K = sample["K_crop"]
     scale = CELL_PX / sample["scene_rgb"].shape[0]
     uv_scene = project(K, sample["scene_contour_cam_m"].astype(np.float64)) * scale
@@ -133,7 +135,13 @@ def sample_row(sample: Mapping[str, np.ndarray], index: int) -> Image:
     ]
     R = sample["T_cam_obj_hypothesis"][:3, :3] @ sample["T_cam_obj"][:3, :3].T
     angle = np.rad2deg(se3.rotation_angle_rad(R))
-    shift_mm = 1e3 * np.linalg.norm(sample["T_cam_obj_hypothesis"][:3, 3] - sample["T_cam_obj"][:3, 3])
+    mesh = meshes.get(int(sample["obj_id"]))  # none in a damaged dataset
+    moved_m = (
+        np.nan
+        if mesh is None
+        else mesh.center_cam_m(sample["T_cam_obj_hypothesis"]) - mesh.center_cam_m(sample["T_cam_obj"])
+    )
+    shift_mm = 1e3 * np.linalg.norm(moved_m)
     caption = (
         f"sample {index}  scene {sample['scene_index']}  object {sample['obj_id']}  hypothesis off by {angle:.1f} deg, "
         f"{shift_mm:.1f} mm  visible {sample['visible_fraction']:.2f}  rejected {sample['rejected']}"

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from posecore.errors import ConfigError, ShardError
 from posecore.files import write_atomic
+from posecore.mesh import Mesh
 from posecore.shard import GROUP, ShardReader, ShardWriter, field_table
 from posecore.store import open_store
 
@@ -30,6 +31,7 @@ class Reproduction:
         scene: Index of its scene.
         hypothesis: Index of the hypothesis in its scene.
         sample: Every field, as read from a shard.
+        meshes: Objects by id.
         differences: Differences from the stored sample, in words; None without a stored sample.
         absent: Reason for no stored sample.
     """
@@ -38,6 +40,7 @@ class Reproduction:
     scene: int
     hypothesis: int
     sample: Mapping[str, np.ndarray]
+    meshes: Mapping[int, Mesh]
     differences: tuple[str, ...] | None
     absent: str = ""
 
@@ -88,8 +91,9 @@ def reproduce(url: str, job: ShardJob, index: int, *, must_compare: bool = False
         there = {name: np.asarray(values[row]) for name, values in stored.items()}
         different = tuple(text for name in sample if (text := _difference(name, there[name], sample[name])))
     return Reproduction(
-        index=index, scene=scene, hypothesis=hypothesis, sample=sample, differences=different, absent=absent
-    )
+        index=index, scene=scene, hypothesis=hypothesis, sample=sample, meshes=job.meshes, differences=different,
+        absent=absent,
+    )  # fmt: skip
 
 
 def save_sample(file: Path, made: Reproduction) -> None:
@@ -105,7 +109,7 @@ def save_sample(file: Path, made: Reproduction) -> None:
         np.savez_compressed(buffer, **dict(made.sample))
         write_atomic(file, buffer.getvalue())
         return
-    sheet = np.concatenate([title_row(), sample_row(made.sample, made.index)])
+    sheet = np.concatenate([title_row(), sample_row(made.sample, made.index, made.meshes)])
     ok, data = cv2.imencode(file.suffix, sheet[..., ::-1])
     assert ok
     write_atomic(file, data.tobytes())

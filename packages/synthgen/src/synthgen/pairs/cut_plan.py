@@ -243,7 +243,7 @@ def _images(dataset: BopDataset, subset: set[tuple[int, int]] | None, config: Cu
     for number, scene_id, im_id in numbered:
         all_ = [gt for gt in dataset.gt(scene_id, im_id) if gt.has_pose]
         meshes = {gt.obj_id: dataset.mesh(gt.obj_id) for gt in all_}
-        annotated = [replace(gt, T_cam_obj=rigid(gt.T_cam_obj)) for gt in all_]
+        annotated = [replace(gt, T_cam_obj=rigid(gt.T_cam_obj, meshes[gt.obj_id])) for gt in all_]
         images.append(
             AnnotatedImage(
                 scene_id=scene_id,
@@ -305,7 +305,7 @@ def _hypotheses_by_image(dataset: BopDataset, file: str | Path) -> dict[tuple[in
     by_image = defaultdict(list)
     unique: set[tuple[int, int, int, bytes]] = set()
     for estimate in read_results(file, dataset):
-        pose = rigid(estimate.T_cam_obj)
+        pose = rigid(estimate.T_cam_obj, dataset.mesh(estimate.obj_id))
         key = estimate.scene_id, estimate.im_id, estimate.obj_id, pose.tobytes()
         if key not in unique:
             unique.add(key)
@@ -315,6 +315,7 @@ def _hypotheses_by_image(dataset: BopDataset, file: str | Path) -> dict[tuple[in
     return by_image
 
 
-def rigid(T: Pose) -> Pose:
-    """The pose with the nearest rotation, because files have few digits."""
-    return se3.make_T(se3.nearest_rotation(T[:3, :3]), T[:3, 3])
+def rigid(T: Pose, mesh: Mesh) -> Pose:
+    """The pose with the nearest rotation about the object's centre, because files have few digits."""
+    R = se3.nearest_rotation(T[:3, :3])
+    return se3.make_T(R, mesh.center_cam_m(T) - R @ mesh.center_m)

@@ -183,7 +183,8 @@ def _sheet(report: VerificationReport, indices: Sequence[int], alt: str) -> str:
             values = reader.read(shard_id)
         except (ShardError, StorageError):  # a damaged shard, which the check of checksums reports
             continue
-        rows.append(sample_row({name: value[row] for name, value in values.items()}, index))
+        sample = {name: value[row] for name, value in values.items()}
+        rows.append(sample_row(sample, index, report.facts.meshes))
     if not rows:
         return ""
     ok, data = cv2.imencode(".jpg", np.concatenate([title_row(), *rows])[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 82])

@@ -37,7 +37,7 @@ def figures(scored: Sequence[Scored], styles: Sequence[LineStyle]) -> str:
 
     drawn = [
         figure("Rotation error at most", "degrees", lambda table: np.rad2deg(column(table, "re_sym_rad")), 45.0),
-        figure("Distance of the origins at most", "mm", millimetres("te_m"), _limit_mm(scored, "te_m")),
+        figure("Distance of the centres at most", "mm", millimetres("te_m"), _limit_mm(scored, "te_m")),
         figure("ADD(-S) at most", "diameters", lambda table: add_s_m(table) / column(table, "diameter_m"), 0.5),
         figure("MSSD at most", "diameters", lambda table: column(table, "mssd_m") / column(table, "diameter_m"), 0.5),
         figure("MSPD at most", f"px, for images {MSPD_WIDTH_PX:g} px wide", _mspd_px, 50.0),

@@ -10,7 +10,7 @@ FIRST = (
     ("vss_mean", "mean VSS", 1.0, "", ".3f"),
     ("add_s_recall_0.1d", "ADD(-S) recall at 0.1 diameter", 100.0, " %", ".1f"),
     ("re_sym_deg_median", "median rotation error", 1.0, "°", ".1f"),
-    ("te_mm_median", "median distance of the origins", 1.0, " mm", ".1f"),
+    ("te_mm_median", "median distance of the centres", 1.0, " mm", ".1f"),
 )
 """Scores in every file's sentence: key, words, factor, unit, number format."""
 

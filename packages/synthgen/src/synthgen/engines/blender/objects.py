@@ -15,7 +15,7 @@ from synthgen.engines.blender.camera import blender_from_opencv
 from synthgen.engines.blender.materials import make_surface, set_material
 from synthgen.engines.blender.meshes import make_mesh, make_texture
 from synthgen.engines.blender.visibility import show
-from synthgen.scene import SceneObject
+from synthgen.scene import SceneObject, with_origins_at
 
 # Cycles bakes the pose of an object whose mesh has no other user into the vertices, and then has to build the BVH again
 # at every move. With two users from the start a pose is only a matrix.
@@ -30,13 +30,20 @@ class Props:
 
     def __init__(self, collection: bpy.types.Collection) -> None:
         self._collection = collection
+        self._centers_m: dict[int, Float[np.ndarray, "3"]] = {}
         self._meshes: dict[int, bpy.types.Mesh] = {}
         self._pools: dict[int, list[bpy.types.Object]] = {}
         self._boxes: dict[int, Float[np.ndarray, "8 3"]] = {}
 
     def load(self, meshes: Mapping[int, Mesh]) -> None:
-        """Make the meshes' datablocks; those of a loaded key are replaced and removed."""
-        for key, mesh in meshes.items():
+        """Make the meshes' datablocks; those of a loaded key are replaced and removed.
+
+        Their origins are the meshes' centres: Blender's float32 has no digits to spare for an origin metres off, and
+        patterns are about the origin.
+        """
+        for key, loaded in meshes.items():
+            self._centers_m[key] = loaded.center_m
+            mesh = loaded.with_origin_at(loaded.center_m)
             block = make_mesh(key, mesh)
             surface = make_surface(f"surface_{key}", make_texture(key, mesh), has_colours=mesh.vertex_rgb is not None)
             block.materials.append(surface)
@@ -58,7 +65,7 @@ class Props:
             RenderError: A mesh key was never loaded.
         """
         used = dict.fromkeys(self._pools, 0)
-        for number, item in enumerate(objects):
+        for number, item in enumerate(with_origins_at(objects, self._centers_m)):
             if item.mesh_key not in used:
                 loaded = ", ".join(map(str, used)) or "none"
                 raise RenderError(f"object {number}: mesh key {item.mesh_key} is not loaded (loaded: {loaded})")
@@ -77,7 +84,8 @@ class Props:
 
     def corners(self, objects: tuple[SceneObject, ...]) -> Float[np.ndarray, "n 8 3"]:
         """Return the corners of the objects' bounding boxes in the camera frame, metres."""
-        return np.stack([se3.apply(item.T_cam_obj, self._boxes[item.mesh_key]) for item in objects])
+        centred = with_origins_at(objects, self._centers_m)
+        return np.stack([se3.apply(item.T_cam_obj, self._boxes[item.mesh_key]) for item in centred])
 
     def remove(self) -> None:
         """Remove every datablock of the pool from Blender."""
@@ -85,6 +93,7 @@ class Props:
         for block in self._meshes.values():
             _remove_mesh(block)
         self._pools, self._meshes, self._boxes = {}, {}, {}
+        self._centers_m = {}
 
     def _make_object(self, key: int) -> bpy.types.Object:
         thing = bpy.data.objects.new(f"object_{key}", self._meshes[key])
