@@ -3,13 +3,16 @@
     python benchmarks/render_throughput.py --engine raster
     python benchmarks/render_throughput.py --engine cycles --flat-scenes 2500
     python benchmarks/render_throughput.py --engine cycles --blenderproc DIR --blenderproc-python PYTHON --rounds 3
+    python benchmarks/render_throughput.py --engine raster --object ../shared/data/lmo/models \\
+        --occluders ../shared/data/lmo/models --hypotheses 1 --hypotheses 8 --against e32e377 --pairs 384
 
 Throughput is measured on the command with all its workers, from the first shard on disk to the last. Stages are
-measured in this process, on one core. With `--blenderproc` (a source checkout of BlenderProc and a
-Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh at the same side, distances and
-samples per pixel in turn with ours: one scene and one hypothesis image a pair, depth and segmentation with both, with
-its default denoiser and with none, on all cores. It renders no occluders, background, contours or distance transforms
-and writes no file. The last line is JSON.
+measured in this process, on one core. `--object` and `--occluders` take what the command takes. With `--against`
+another commit of this repository renders the same, in turn with this one, in the same rounds. With `--blenderproc` (a
+source checkout of BlenderProc and a Python that has bpy 4.2 and BlenderProc's packages) the peer renders the same mesh
+at the same side, distances and samples per pixel in turn with ours: one scene and one hypothesis image a pair, depth
+and segmentation with both, with its default denoiser and with none, on all cores. It renders no occluders, background,
+contours or distance transforms and writes no file. The last line is JSON.
 """
 
 import argparse
@@ -20,7 +23,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +32,19 @@ import numpy as np
 import psutil
 from posecore import shard
 from posecore.camera import Camera
-from posecore.mesh import Mesh, load_mesh
+from posecore.mesh import Mesh
 from synthgen.config import SynthConfig, load_config
-from synthgen.draw.target import make_target
+from synthgen.draw.target import make_target, make_targets
 from synthgen.inputs.assets import Assets
+from synthgen.inputs.sources import Sources
 from synthgen.pairs import data_card
 from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
 
 Fields = dict[str, Any]
+Environment = dict[str, str]
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("posecore", "synthgen", "refinenet", "evalkit")
 
 
 class Stopwatch:
@@ -59,13 +68,13 @@ class Stopwatch:
         setattr(owner, method, timed)
 
 
-def stages(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
+def stages(config: SynthConfig, meshes: dict[int, Mesh], assets: Assets, scenes: int) -> Fields:
     """Milliseconds a pair by stage, one process, one thread."""
     limit_threads(1)
     scenes = max(scenes, scenes_per_shard(config))  # encoding is timed on whole shards
-    maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
-    card = data_card.rendered_card(config, config.shard_size, {1: mesh}, Assets())
-    for scene in range(3):  # loads, compiles
+    maker = PairMaker(config, make_targets(meshes, config, assets), assets, threads=1)
+    card = data_card.rendered_card(config, config.shard_size, meshes, assets)
+    for scene in range(3 * len(meshes)):  # loads, compiles
         maker.samples(10_000_000 + scene)
     watch = Stopwatch()
     watch.wrap(maker, "accepted_scene", "draw")
@@ -101,7 +110,23 @@ def scenes_per_shard(config: SynthConfig) -> int:
     return config.shard_size // config.hypotheses_per_scene
 
 
-def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
+@contextmanager
+def packages_of(commit: str | None) -> Iterator[Environment | None]:
+    """Environment in which Python imports the four packages of a commit; of this checkout, inherited, for None."""
+    if commit is None:
+        yield None
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        git = ["git", "-C", str(ROOT), "worktree"]
+        subprocess.run([*git, "add", "--detach", folder, commit], check=True, capture_output=True)
+        try:
+            sources = os.pathsep.join(f"{folder}/packages/{name}/src" for name in PACKAGES)
+            yield {**os.environ, "PYTHONPATH": sources}
+        finally:
+            subprocess.run([*git, "remove", "--force", folder], check=True)
+
+
+def throughput(arguments: argparse.Namespace, command: list[str], environment: Environment | None = None) -> float:
     """Pairs per second of the command, from its first shard to its last."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "shards"
@@ -109,6 +134,7 @@ def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
             [*command, "--n", str(arguments.pairs), "--workers", str(arguments.workers), "--out", str(out), "--quiet"],
             stderr=subprocess.PIPE,
             text=True,
+            env=environment,
         )
         commits: list[tuple[float, int]] = []
         manifest = out / "manifest.jsonl"
@@ -128,10 +154,10 @@ def throughput(arguments: argparse.Namespace, command: list[str]) -> float:
     return rate
 
 
-def flatness(config: SynthConfig, mesh: Mesh, scenes: int) -> Fields:
+def flatness(config: SynthConfig, meshes: dict[int, Mesh], assets: Assets, scenes: int) -> Fields:
     """Time per scene and memory of a process at the beginning and at the end of many scenes."""
     limit_threads(1)
-    maker = PairMaker(config, [make_target(1, mesh, config)], threads=1)
+    maker = PairMaker(config, make_targets(meshes, config, assets), assets, threads=1)
     process, h = psutil.Process(), config.hypotheses_per_scene
     seconds, cpu_s, rss = [], [], []
     for scene in range(scenes):
@@ -178,11 +204,23 @@ def peer(arguments: argparse.Namespace, config: SynthConfig, mesh: Mesh, denoise
 
 def main() -> None:
     """Measure and print."""
+    arguments = parse()
+    environment = packages_of(arguments.against)
+    with environment as before:
+        for hypotheses in arguments.hypotheses or [None]:
+            measure(arguments, hypotheses, before)
+
+
+def parse() -> argparse.Namespace:
+    """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--object", type=Path, default=Path("examples/objects/tug.ply"), help="mesh in millimetres")
+    parser.add_argument("--object", type=Path, default=Path("examples/objects/tug.ply"), help="mesh or folder, in mm")
+    parser.add_argument("--occluders", type=Path, help="mesh or folder, in mm")
     parser.add_argument("--engine", default="cycles", choices=["cycles", "eevee", "raster"])
     parser.add_argument("--preset", default="default")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--hypotheses", type=int, action="append", help="hypotheses a scene; repeatable")
+    parser.add_argument("--against", metavar="COMMIT", help="measure this commit too")
     parser.add_argument("--pairs", type=int, default=1536, help="pairs of a throughput run")
     parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)))
     parser.add_argument("--rounds", type=int, default=3)
@@ -194,21 +232,37 @@ def main() -> None:
     arguments = parser.parse_args()
     if (arguments.blenderproc is None) != (arguments.blenderproc_python is None):
         parser.error("--blenderproc and --blenderproc-python go together")
-    config = load_config(arguments.preset, arguments.overrides, {"engine": arguments.engine})
-    mesh = load_mesh(arguments.object, units="mm")
+    if arguments.blenderproc is not None and not arguments.object.is_file():
+        parser.error("--blenderproc renders one mesh; give a file as --object")
+    return arguments
+
+
+def measure(arguments: argparse.Namespace, hypotheses: int | None, before: Environment | None) -> None:
+    """Measure and print one number of hypotheses a scene, by default the preset's."""
+    overrides = [*arguments.overrides, *([] if hypotheses is None else [f"hypotheses_per_scene={hypotheses}"])]
+    config = load_config(arguments.preset, overrides, {"engine": arguments.engine})
+    sources = Sources(objects=(arguments.object,), occluders=arguments.occluders)
+    meshes, assets = sources.meshes(), sources.assets()
     command = [sys.executable, "-m", "synthgen.cli", "render", "--object", str(arguments.object)]
-    command += ["--engine", arguments.engine, "--preset", arguments.preset, "--test-images", "0"]
-    command += [part for override in arguments.overrides for part in ("--set", override)]
+    command += [] if arguments.occluders is None else ["--occluders", str(arguments.occluders)]
+    command += ["--engine", arguments.engine, "--preset", arguments.preset]
+    command += [part for override in overrides for part in ("--set", override)]
     rates: list[float] = []
+    earlier: list[float] = []
     peers: dict[str, list[float]] = {"none": [], "default": []}
     for _ in range(arguments.rounds):
-        rates.append(throughput(arguments, command))
+        rates.append(throughput(arguments, [*command, "--test-images", "0"]))
         print(f"synthgen, {arguments.workers} workers: {rates[-1]:.1f} pairs/s", flush=True)
+        if before is not None:
+            earlier.append(throughput(arguments, command, before))
+            print(f"synthgen of {arguments.against}: {earlier[-1]:.1f} pairs/s", flush=True)
         if arguments.blenderproc is not None:
             for denoiser, seconds in peers.items():
-                seconds.append(peer(arguments, config, mesh, denoiser))
+                seconds.append(peer(arguments, config, next(iter(meshes.values())), denoiser))
                 print(f"BlenderProc, denoiser {denoiser}: {seconds[-1]:.3f} s a pair", flush=True)
     result: Fields = {
+        "object": str(arguments.object),
+        "faces": sum(len(mesh.faces) for mesh in meshes.values()) // len(meshes),
         "engine": config.engine,
         "patch_px": config.patch_px,
         "samples": config.samples,
@@ -217,16 +271,20 @@ def main() -> None:
         "pairs_per_s": round(statistics.median(rates), 2),
         "pairs_per_s_all": [round(rate, 2) for rate in rates],
     }
+    if before is not None:
+        result[f"pairs_per_s_{arguments.against}"] = [round(rate, 2) for rate in earlier]
+        result[f"times_{arguments.against}"] = round(float(np.median(np.divide(rates, earlier))), 2)
     if arguments.blenderproc is not None:
         for denoiser, seconds in peers.items():
             result[f"blenderproc_{denoiser}_s_per_pair"] = round(statistics.median(seconds), 4)
             ratios = np.multiply(seconds, rates)
             result[f"times_blenderproc_{denoiser}"] = round(float(np.median(ratios)), 1)
-    result |= stages(config, mesh, arguments.stage_scenes)
-    for name, value in result["ms_per_pair"].items():
-        print(f"{name:24s} {value:8.3f} ms a pair")
+    if arguments.stage_scenes:
+        result |= stages(config, meshes, assets, arguments.stage_scenes)
+        for name, value in result["ms_per_pair"].items():
+            print(f"{name:24s} {value:8.3f} ms a pair")
     if arguments.flat_scenes:
-        result["flat"] = flatness(config, mesh, arguments.flat_scenes)
+        result["flat"] = flatness(config, meshes, assets, arguments.flat_scenes)
     print(json.dumps(result))
 
 

@@ -59,6 +59,26 @@ def scene_of(*objects: SceneObject, **changes: Any) -> Scene:
     return Scene(**{**fields, **changes})
 
 
+def box_and_plate(size_m: float, diameters: float) -> tuple[dict[int, Mesh], Scene, tuple[float, float]]:
+    """A box, and a thousandth of its size before it a plate a third as wide, a number of diameters away.
+
+    Returns:
+        The meshes, the scene (the box is object 0), and the camera z of the faces that box and plate turn to the
+        camera.
+    """
+    meshes = {1: box(0.6 * size_m, 0.5 * size_m, 0.4 * size_m), 2: box(0.2 * size_m, 0.2 * size_m, 0.02 * size_m)}
+    z_m = diameters * meshes[1].diameter_m
+    box_z_m = z_m - 0.2 * size_m
+    plate_z_m = box_z_m - 1e-3 * size_m - 0.02 * size_m
+    scene = scene_of(
+        SceneObject(mesh_key=1, T_cam_obj=at(0, 0, z_m)),
+        SceneObject(mesh_key=2, T_cam_obj=at(0, 0, plate_z_m + 0.01 * size_m)),
+        camera=Camera(K=intrinsics(40 * diameters, 40 * diameters, 32.0, 32.0), width_px=64, height_px=64),
+        samples=1,
+    )
+    return meshes, scene, (box_z_m, plate_z_m)
+
+
 def busy_scene(seed: int, keys: tuple[int, ...], **changes: Any) -> Scene:
     """Objects, poses, materials and lights drawn from a seed."""
     rng = np.random.default_rng(seed)

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from posecore import se3
 from posecore.errors import MeshError
-from posecore.mesh import Mesh, diameter, load_mesh, save_ply
+from posecore.mesh import Mesh, load_mesh, save_ply
 
 
 def write_box(path: Path, extents: tuple[float, float, float] = (60, 40, 30)) -> Path:
@@ -64,24 +64,6 @@ def test_a_saved_texture_lies_beside_the_ply_and_loads_again(tmp_path: Path) -> 
     (tmp_path / "copy.png").unlink()
     with pytest.raises(MeshError, match=r"its texture .*copy\.png is missing"):
         load_mesh(tmp_path / "copy.ply")
-
-
-def test_diameter_is_the_largest_vertex_distance() -> None:
-    points = np.random.default_rng(0).normal(size=(300, 3))
-    brute = np.linalg.norm(points[:, None] - points, axis=-1).max()
-    assert diameter(points) == pytest.approx(brute)
-    flat = points * [1, 1, 0]
-    assert diameter(flat) == pytest.approx(np.linalg.norm(flat[:, None] - flat, axis=-1).max())
-
-
-def test_diameter_of_many_points_is_still_exact() -> None:
-    """Points near the middle are left out; on a sphere none is, and more are left than are compared at once."""
-    rng = np.random.default_rng(1)
-    sphere = rng.normal(size=(1500, 3))
-    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
-    for points in (sphere, sphere * [1, 1, 3], 500 + sphere):
-        brute = max(float(np.linalg.norm(points - p, axis=1).max()) for p in points)
-        assert diameter(points) == pytest.approx(brute, rel=1e-12)
 
 
 @pytest.mark.slow

@@ -309,12 +309,21 @@ def test_the_pbr_preset_shows_many_objects_on_a_table(tmp_path, meshes):
 
 
 @pytest.mark.slow
-def test_depth_steps_grow_for_far_scenes(config_of, meshes):
+@pytest.mark.parametrize(
+    ("size", "overrides", "scale_mm"),
+    [
+        (1.0, (), 0.1),
+        (1.0, ("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0),
+        (100.0, ("distance.unit=m", "distance.min=100", "distance.max=110"), 10.0),
+        (0.025, (), 0.01),
+    ],
+)
+def test_depth_steps_follow_the_scenes_and_the_objects(config_of, meshes, size, overrides, scale_mm):
     from synthgen.draw.target import make_targets
 
-    for overrides, scale in (((), 0.1), (("distance.unit=m", "distance.min=5", "distance.max=9"), 1.0)):
-        config = config_of(*overrides)
-        assert dataset_writer._depth_scale(config, make_targets(meshes, config)) == scale
+    config = config_of(*overrides)
+    scaled = {i: replace(mesh, vertices_m=size * mesh.vertices_m) for i, mesh in meshes.items()}
+    assert dataset_writer._depth_scale(config, make_targets(scaled, config)) == pytest.approx(scale_mm)
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from blender_scenes import MATT, SKEWED, at, box, busy_scene, quad, scene_of
+from blender_scenes import MATT, SKEWED, at, box, box_and_plate, busy_scene, quad, scene_of
 from posecore import se3
 from posecore.camera import Camera, intrinsics, project
 from posecore.errors import MeshError, RenderError
@@ -91,6 +91,26 @@ def test_depth_is_camera_z_at_the_pixel_centre(cycles):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", ["raster", "cycles"])
+@pytest.mark.parametrize("size_m", [0.002, 0.1, 10.0])
+@pytest.mark.parametrize("diameters", [1.5, 8.0, 103.0, 500.0])
+def test_objects_of_any_size_are_drawn_at_any_distance(name, size_m, diameters):
+    """What is a thousandth of the object nearer hides it, and depths are exact to 2e-7 of themselves."""
+    meshes, scene, (box_z_m, plate_z_m) = box_and_plate(size_m, diameters)
+    engine = make_engine(name, threads=2)
+    engine.load(meshes)
+    layers = engine.render(scene)
+    engine.close()
+    f = scene.camera.K[0, 0] * size_m
+    for index, z_m, width, height in ((0, box_z_m, 0.6, 0.5), (1, plate_z_m, 0.2, 0.2)):
+        hit = layers.index == index
+        rows, columns = np.flatnonzero(hit.any(axis=1)), np.flatnonzero(hit.any(axis=0))
+        assert np.ptp(columns) + 1 == pytest.approx(f * width / z_m, abs=1.01)
+        assert np.ptp(rows) + 1 == pytest.approx(f * height / z_m, abs=1.01)
+        np.testing.assert_allclose(layers.depth_m[hit], z_m, rtol=2e-7)
+    assert (layers.index[31:33, 31:33] == 1).all()
+
+
 def test_geometry_agrees_with_the_rasteriser(cycles, meshes):
     rng = np.random.default_rng(3)
     with Rasteriser(meshes) as raster:

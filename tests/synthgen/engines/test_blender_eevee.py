@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from blender_scenes import SKEWED, at, box, scene_of
+from blender_scenes import SKEWED, at, box, box_and_plate, scene_of
 from synthgen.engines.make import make_engine
 from synthgen.scene import Light, SceneObject
 
@@ -32,3 +32,16 @@ def test_eevee_labels_pixels_as_cycles_does():
     np.testing.assert_allclose(eevee.depth_m[both], cycles.depth_m[both], atol=0.5e-3)
     assert np.abs(eevee.alpha - cycles.alpha).mean() < 0.02
     assert eevee.rgb_linear[both].mean() == pytest.approx(cycles.rgb_linear[both].mean(), rel=0.3)
+
+
+@pytest.mark.parametrize(("size_m", "diameters"), [(0.002, 8.0), (10.0, 8.0), (10.0, 500.0)])
+def test_depths_of_tiny_and_far_objects_are_precise(size_m, diameters):
+    meshes, scene, z_m = box_and_plate(size_m, diameters)
+    engine = make_engine("eevee", threads=2)
+    engine.load(meshes)
+    layers = engine.render(scene)
+    engine.close()
+    for index in (0, 1):
+        hit = layers.index == index
+        assert hit.sum() > 80
+        np.testing.assert_allclose(layers.depth_m[hit], z_m[index], rtol=1e-5)

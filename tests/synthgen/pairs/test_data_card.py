@@ -39,9 +39,14 @@ def test_any_size_of_object_fits_the_defaults(config_of, tug, scale):
     assert side[0] == pytest.approx(side[1])
 
 
-@pytest.mark.parametrize(("diameter_m", "step_m"), [(0.03, 1e-4), (0.12, 1e-4), (2.0, 8e-4)])
-def test_depth_of_large_objects_fits_in_coarser_steps(diameter_m, step_m):
-    """By default an object stands up to 10 diameters away, with props up to 4 diameters behind it."""
+@pytest.mark.parametrize(
+    ("diameter_m", "step_m"), [(0.002, 6.25e-6), (0.03, 1e-4), (0.12, 1e-4), (2.0, 8e-4), (10.0, 3.2e-3)]
+)
+def test_depth_steps_follow_the_object(diameter_m, step_m):
+    """By default an object stands up to 10 diameters away, with props up to 4 diameters behind it.
+
+    16 bits hold the largest depth, and the smallest object is 200 steps wide.
+    """
     half = diameter_m / 2
     mesh = Mesh(
         vertices_m=np.array([[-half, 0, 0], [half, 0, 0], [0, half / 2, 0], [0, 0, half / 2]]),
@@ -51,3 +56,4 @@ def test_depth_of_large_objects_fits_in_coarser_steps(diameter_m, step_m):
     card = data_card.rendered_card(load_config("default"), 8, {1: mesh}, Assets())
     assert card["depth_step_m"] == pytest.approx(step_m)
     assert card["depth_step_m"] * 65535 > 14 * diameter_m
+    assert card["depth_step_m"] * 200 <= diameter_m

@@ -12,9 +12,8 @@ import trimesh
 from jaxtyping import Float, Int, UInt8
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
-from scipy.spatial.distance import cdist
 
+from posecore.diameter import diameter
 from posecore.errors import MeshError
 from posecore.files import write_atomic
 from posecore.mesh_files import GREY, METRE_SUFFIXES, TIMES_COLOURS, mesh_bytes, read_surface
@@ -136,24 +135,6 @@ class Mesh:
         volumes = np.einsum("fi,fi->f", corners_m[:, 0], np.cross(corners_m[:, 1], corners_m[:, 2])) / 6.0
         of_piece = np.bincount(piece[faces[:, 0]], weights=volumes)
         return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
-
-
-def diameter(points_m: Float[np.ndarray, "v 3"]) -> float:
-    """Largest distance between two points, over their convex hull."""
-    points = np.asarray(points_m, np.float64)
-    try:
-        points = points[ConvexHull(points).vertices]
-    except QhullError:  # flat or fewer than four points: all pairs
-        points = np.unique(points, axis=0)
-    if len(points) < 2:
-        return 0.0
-    # The ends of the longest distance are both far from the middle: no nearer to it than that distance minus the
-    # largest radius. Most vertices of a smooth part are.
-    radius = np.linalg.norm(points - (points.min(axis=0) + points.max(axis=0)) / 2, axis=1)
-    at_least = cdist(points[[radius.argmax()]], points).max()
-    points = points[radius >= (1 - 1e-9) * at_least - radius.max()]
-    blocks = range(0, len(points), 512)  # of rows, so that memory stays bounded for a sphere, where all are left
-    return max(float(cdist(points[i : i + 512], points[i:]).max()) for i in blocks)
 
 
 def mesh_digest(mesh: Mesh) -> str:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -37,7 +37,7 @@ from synthgen.draw.target import TargetObject, make_targets
 from synthgen.engines.blender import scratch
 from synthgen.engines.blender.paths import forget_blenders_paths
 from synthgen.inputs.assets import Assets
-from synthgen.pairs.data_card import versions
+from synthgen.pairs.data_card import DEPTH_STEPS_A_DIAMETER, versions
 from synthgen.pairs.pair_maker import limit_threads
 
 _MAX_DEPTH_STEP = 65535
@@ -262,11 +262,20 @@ def _write(address: Address) -> FrameEntry:
     return _Worker.renderer.write(*address)
 
 
-def _depth_scale(config: SynthConfig, targets: Iterable[TargetObject]) -> float:
-    """Depth step in millimetres: 0.1 (BOP's default), or 1 where depths may exceed 16 bits of 0.1 mm."""
-    farthest_m = max(t.distance_m[1] + t.reach_m for t in targets)
+def _depth_scale(config: SynthConfig, targets: Sequence[TargetObject]) -> float:
+    """Depth step in millimetres: 0.1 (BOP's default), or a power of ten.
+
+    Larger where depths may exceed 16 bits, smaller where an object is less than 200 steps wide.
+    """
     extent = max(t.distance_m[1] for t in targets) * (config.frames.objects[1] > 1)
-    return 0.1 if farthest_m + extent < 0.1e-3 * _MAX_DEPTH_STEP else 1.0
+    farthest_mm = (max(t.distance_m[1] + t.reach_m for t in targets) + extent) * 1e3
+    smallest_mm = min(t.mesh.diameter_m for t in targets) * 1e3
+    power = -1
+    while farthest_mm >= _MAX_DEPTH_STEP * 10.0**power:
+        power += 1
+    while smallest_mm < DEPTH_STEPS_A_DIAMETER * 10.0**power and farthest_mm < _MAX_DEPTH_STEP * 10.0 ** (power - 1):
+        power -= 1
+    return float(10.0**power)
 
 
 def _targets(folder: Path, config: SynthConfig, plan: FramePlan) -> list[Any]:

@@ -26,7 +26,8 @@ from synthgen.pairs.cut_plan import Plan
 
 UNITS = {"length": "m", "angle": "rad", "image": "px", "transform": "p_cam = T_cam_obj @ p_obj"}
 DEPTH_STEPS = 65535  # depth is stored in 16 bits
-FINEST_DEPTH_STEP_M = 1e-4
+USUAL_DEPTH_STEP_M = 1e-4
+DEPTH_STEPS_A_DIAMETER = 200  # at least, where 16 bits reach that far
 _PACKAGES = ("synthgen", "posecore", "numpy", "opencv-python-headless", "numcodecs", "moderngl", "trimesh")
 """Packages whose version may change a sample's bytes."""
 _CAMERA_PX = 1e-6
@@ -68,6 +69,7 @@ def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool 
         drawn: Whether hypotheses were drawn, or read from a result file.
     """
     camera = plan.images[0].camera
+    smallest_m = min(mesh.diameter_m for mesh in plan.meshes.values())
     deepest_m = max(
         float(dataset.mesh(obj_id).center_cam_m(T)[2]) + dataset.mesh(obj_id).diameter_m
         for image in plan.images
@@ -82,7 +84,7 @@ def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool 
         "shard_size": config.shard_size,
         "patch_px": config.patch_px,
         "contour_points": config.contour_points,
-        "depth_step_m": _depth_step_m(deepest_m),
+        "depth_step_m": _depth_step_m(deepest_m, smallest_m),
         "seed": config.seed,
         "source": {
             "dataset": printable(dataset.name),
@@ -150,14 +152,17 @@ def create_writer(url: str, card: Mapping[str, Any]) -> ShardWriter:
 
 def depth_step_m(targets: Sequence[TargetObject]) -> float:
     """Depth quantisation of the deepest scene of any object, metres."""
-    return _depth_step_m(max(t.distance_m[1] + t.reach_m for t in targets))
+    deepest_m = max(t.distance_m[1] + t.reach_m for t in targets)
+    return _depth_step_m(deepest_m, min(t.mesh.diameter_m for t in targets))
 
 
-def _depth_step_m(deepest_m: float) -> float:
-    """0.1 mm, doubled until 16 bits reach the largest depth."""
-    step_m = FINEST_DEPTH_STEP_M
+def _depth_step_m(deepest_m: float, smallest_m: float) -> float:
+    """0.1 mm, doubled until 16 bits reach the largest depth, or halved until an object is 200 steps wide."""
+    step_m = USUAL_DEPTH_STEP_M
     while deepest_m > DEPTH_STEPS * step_m:
         step_m *= 2
+    while smallest_m < DEPTH_STEPS_A_DIAMETER * step_m and deepest_m <= DEPTH_STEPS * step_m / 2:
+        step_m /= 2
     return step_m
 
 

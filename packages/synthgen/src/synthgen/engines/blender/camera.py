@@ -9,7 +9,9 @@ from posecore.camera import Camera, project
 SENSOR_WIDTH_MM = 36.0  # any width serves: Blender keeps only the ratio of lens to sensor
 MIN_SIDE_PX = 4  # Blender raises a smaller resolution to this in silence
 FILTER_REACH_PX = 2  # no less than half the pixel filter: how far an object's edge colours pixels around it
-NEAREST_M = 0.01
+USUAL_CLIP_M = (0.01, 100.0)
+"""Near and far plane of a scene that fits between them."""
+_NEAR_FRACTION = 0.05  # least near plane of another scene, over the camera z of its nearest object's centre
 
 Region = tuple[int, int, int, int]
 
@@ -77,7 +79,34 @@ def lens_for(camera: Camera, region_px: Region) -> BlenderLens:
     )
 
 
-def occupied_region(camera: Camera, region_px: Region, corners_cam_m: Float[np.ndarray, "n 8 3"]) -> Region | None:
+def clip_range_m(
+    corners_cam_m: Float[np.ndarray, "n 8 3"], usual_m: tuple[float, float] | None = USUAL_CLIP_M
+) -> tuple[float, float]:
+    """Near and far plane around the objects, metres.
+
+    An object that reaches behind the camera does not bring the near plane closer than a twentieth of the camera z of
+    the nearest object's centre, as in `posecore.raster`: the steps of a depth buffer grow with z^2 / near.
+
+    Args:
+        corners_cam_m: Corners of each object's bounding box.
+        usual_m: Planes to keep where every object in front of the camera is between them. A ray starts at the near
+            plane, so that another one would change the last bits of Cycles' depths.
+    """
+    z_m = corners_cam_m[..., 2]
+    nearest_m, farthest_m, center_m = z_m.min(axis=1), float(z_m.max()), z_m.mean(axis=1)
+    if not (center_m > 0).any():
+        return USUAL_CLIP_M
+    if usual_m is not None:
+        in_front_m = nearest_m[nearest_m > 0]
+        if farthest_m <= usual_m[1] and (in_front_m >= usual_m[0]).all():
+            return usual_m
+    near_m = max(0.99 * float(nearest_m.min()), _NEAR_FRACTION * float(center_m[center_m > 0].min()))
+    return near_m, 1.01 * farthest_m
+
+
+def occupied_region(
+    camera: Camera, region_px: Region, corners_cam_m: Float[np.ndarray, "n 8 3"], near_m: float = USUAL_CLIP_M[0]
+) -> Region | None:
     """Return the part of the region that objects can cover, or None without such a part.
 
     An empty pixel is a third of the work of a full one, and crops around small or distant objects are mostly empty.
@@ -87,9 +116,10 @@ def occupied_region(camera: Camera, region_px: Region, corners_cam_m: Float[np.n
         region_px: x0, y0, width, height.
         corners_cam_m: Corners of each object's bounding box. A box behind the camera or around it gives no bound:
             then the region itself is returned.
+        near_m: Near plane.
     """
     corners = corners_cam_m.reshape(-1, 3)
-    if (corners[:, 2] < NEAREST_M).any():
+    if (corners[:, 2] < near_m).any():
         return region_px
     uv = project(camera.K, corners)
     x0, y0, width, height = region_px

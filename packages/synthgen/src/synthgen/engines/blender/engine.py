@@ -19,7 +19,14 @@ except ImportError as error:
 
 from synthgen.engine import RenderedScene
 from synthgen.engines.blender import scratch
-from synthgen.engines.blender.camera import NEAREST_M, SENSOR_WIDTH_MM, Region, lens_for, occupied_region
+from synthgen.engines.blender.camera import (
+    SENSOR_WIDTH_MM,
+    USUAL_CLIP_M,
+    Region,
+    clip_range_m,
+    lens_for,
+    occupied_region,
+)
 from synthgen.engines.blender.exr import read_channels
 from synthgen.engines.blender.lights import Lamps, World
 from synthgen.engines.blender.materials import INDEX_AOV
@@ -32,7 +39,6 @@ from synthgen.scene import Scene
 
 Channels = dict[str, Float[np.ndarray, "h w"]]
 
-CLIP_RANGE_M = (NEAREST_M, 100.0)
 INDEX_CHANNELS = {"cycles": "IndexOB.X", "eevee": f"{INDEX_AOV}.X"}
 
 
@@ -40,8 +46,8 @@ class BlenderEngine:
     """Renders scenes in one persistent Blender scene whose datablocks are reused.
 
     Depth and index are sampled once, at the pixels' centres: by Cycles with the first of its samples, by EEVEE in a
-    render of their own, since its samples all count for every layer. Surfaces nearer than 1 cm or farther than 100 m
-    are clipped. Several engines may live in one process; a process that has one must not fork.
+    render of their own, since its samples all count for every layer. Near and far plane are around the scene's objects
+    (`camera.clip_range_m`). Several engines may live in one process; a process that has one must not fork.
 
     Args:
         name: 'cycles' or 'eevee'.
@@ -66,7 +72,6 @@ class BlenderEngine:
         self._camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
         self._camera.data.sensor_fit = "HORIZONTAL"
         self._camera.data.sensor_width = SENSOR_WIDTH_MM
-        self._camera.data.clip_start, self._camera.data.clip_end = CLIP_RANGE_M
         self._scene.collection.objects.link(self._camera)
         self._scene.camera = self._camera
         self._props = Props(self._scene.collection)
@@ -97,11 +102,14 @@ class BlenderEngine:
         self._props.set(scene.objects)
         self._lamps.set(scene.lights)
         self._world.set(scene.ambient_rgb, scene.environment)
-        occupied = occupied_region(scene.camera, scene.region_px, self._props.corners(scene.objects))
+        corners_cam_m = self._props.corners(scene.objects)
+        clip_m = clip_range_m(corners_cam_m, USUAL_CLIP_M if self.name == "cycles" else None)
+        occupied = occupied_region(scene.camera, scene.region_px, corners_cam_m, clip_m[0])
         layers = _empty(scene.region_px)
         if occupied is None:
             return layers
         self._point_camera(scene.camera, occupied)
+        self._camera.data.clip_start, self._camera.data.clip_end = clip_m
         if self.name == "cycles":
             self._scene.cycles.samples = scene.samples
             self._scene.cycles.seed = scene.render_seed
