@@ -301,6 +301,7 @@ def batch_of(dataset, config, training=True, n=8):
 
 
 def test_every_stream_brings_the_depth_to_the_network_that_sees_it(dataset, mesh):
+    mesh = mesh.with_origin_at(mesh.center_m)  # as pairs have it
     online = batch_of(dataset, flow_config())
     assert batch_of(dataset, small()).inputs.hypothesis_depth_m is None
     config = flow_config("on_policy.fraction=1", "on_policy.begin=0", "on_policy.full=0")

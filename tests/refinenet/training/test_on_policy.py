@@ -32,6 +32,12 @@ class Moves(nn.Module):
 
 
 @pytest.fixture(scope="module")
+def centred(mesh):
+    """The object as pairs have it: its origin at the centre."""
+    return mesh.with_origin_at(mesh.center_m)
+
+
+@pytest.fixture(scope="module")
 def batch(dataset):
     config = small("hypothesis.max_angle_deg=10", "hypothesis.max_translation_diameter=0.1")
     config = replace(config, augment=replace(config.augment, noise=0.0, blur=0.0, permute_channels=1.0))
@@ -44,8 +50,8 @@ def batch(dataset):
     return made
 
 
-def moved(mesh, batch, *overrides):
-    with OnPolicyHypotheses(small(*OWN, *overrides), {1: mesh}) as own:
+def moved(centred, batch, *overrides):
+    with OnPolicyHypotheses(small(*OWN, *overrides), {1: centred}) as own:
         return own(Moves(), batch, step=3)
 
 
@@ -56,24 +62,24 @@ def test_the_share_grows_and_then_stays():
     assert fraction_at(small().on_policy, 50, 100) == 0
 
 
-def test_hypotheses_go_where_the_network_moved_them(mesh, batch):
-    after = moved(mesh, batch)
+def test_hypotheses_go_where_the_network_moved_them(centred, batch):
+    after = moved(centred, batch)
     wanted = poses.apply_update(batch.inputs.T_cam_obj, Moves()(batch.inputs))
     torch.testing.assert_close(after.inputs.T_cam_obj, wanted, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.target.T_cam_obj, batch.target.T_cam_obj)
     torch.testing.assert_close(after.target.T_cam_obj_hypothesis, wanted, atol=1e-5, rtol=0)
-    centre = torch.from_numpy(mesh.center_m.astype(np.float32)).repeat(8, 1, 1)
+    centre = torch.from_numpy(centred.center_m.astype(np.float32)).repeat(8, 1, 1)
     at = centre @ wanted[:, :3, :3].transpose(1, 2) + wanted[:, None, :3, 3]
     assert (poses.project(after.inputs.K_crop, at) - 32).abs().max() < 1e-2  # the window inference would cut
 
 
-def test_scene_and_labels_follow_the_new_window(mesh, batch):
+def test_scene_and_labels_follow_the_new_window(centred, batch):
     """Truth rendered with the new camera: its contour lies on the resampled distance transform's zero."""
     from posecore.raster import Rasteriser
 
-    after = moved(mesh, batch)
+    after = moved(centred, batch)
     K, T = after.inputs.K_crop.double().numpy(), after.target.T_cam_obj.double().numpy()
-    with Rasteriser({1: mesh}) as rasteriser:
+    with Rasteriser({1: centred}) as rasteriser:
         truth = rasteriser.render(1, K, T, 64, 64)
     for mask, distance, bits in zip(truth.mask, after.target.scene_distance_px, after.target.scene_bits, strict=True):
         assert distance.numpy()[contour.contour_mask(mask)].mean() < 1.0
@@ -87,7 +93,7 @@ def test_scene_and_labels_follow_the_new_window(mesh, batch):
     np.testing.assert_allclose(after.target.visible_iou.numpy(), overlap, atol=0.03)
 
 
-def test_renders_keep_the_batchs_colours(mesh, batch):
+def test_renders_keep_the_batchs_colours(centred, batch):
     """A network that moves nothing: the same render in the same permuted colours."""
 
     class Stays(nn.Module):
@@ -95,44 +101,44 @@ def test_renders_keep_the_batchs_colours(mesh, batch):
             b = len(pair.K_crop)
             return PoseUpdate(torch.eye(3).repeat(b, 1, 1), torch.zeros(b, 3))
 
-    with OnPolicyHypotheses(small(*OWN), {1: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {1: centred}) as own:
         after = own(Stays(), batch, step=0)
     difference = (after.inputs.hypothesis_rgb.int() - batch.inputs.hypothesis_rgb.int()).abs()
     assert (difference <= 1).float().mean() > 0.99
     assert (after.inputs.scene_rgb.int() - batch.inputs.scene_rgb.int()).abs().float().mean() < 1
 
 
-def test_a_network_gone_astray_leaves_pairs_as_they_were(mesh, batch):
+def test_a_network_gone_astray_leaves_pairs_as_they_were(centred, batch):
     class Astray(nn.Module):
         def forward(self, pair):
             b = len(pair.K_crop)
             far = torch.tensor([[0.0, 0.0, -9.0], [9.0, 0.0, 0.0], [torch.nan, 0.0, 0.0], [0.0, 0.0, 50.0]])
             return PoseUpdate(torch.eye(3).repeat(b, 1, 1), far.repeat(b // 4, 1))
 
-    with OnPolicyHypotheses(small(*OWN), {1: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {1: centred}) as own:
         after = own(Astray(), batch, step=0)
     assert torch.equal(after.inputs.hypothesis_rgb, batch.inputs.hypothesis_rgb)
     assert torch.equal(after.inputs.T_cam_obj, batch.inputs.T_cam_obj)
 
 
-def test_part_of_a_batch_is_replaced_and_the_same_part_again(mesh, batch):
+def test_part_of_a_batch_is_replaced_and_the_same_part_again(centred, batch):
     half = "on_policy.fraction=0.5"
-    first, again = moved(mesh, batch, half), moved(mesh, batch, half)
+    first, again = moved(centred, batch, half), moved(centred, batch, half)
     changed = (first.inputs.T_cam_obj != batch.inputs.T_cam_obj).flatten(1).any(1)
     assert changed.sum() == 4
     assert torch.equal(first.inputs.hypothesis_rgb, again.inputs.hypothesis_rgb)
     assert torch.equal(first.inputs.hypothesis_rgb[~changed], batch.inputs.hypothesis_rgb[~changed])
 
 
-def test_each_object_is_seen_through_its_own_window(mesh, batch):
+def test_each_object_is_seen_through_its_own_window(centred, batch):
     """A category: rows of two objects, the second twice as large, in the order of their ids."""
-    twice = replace(mesh, vertices_m=2 * mesh.vertices_m)
+    twice = replace(centred, vertices_m=2 * centred.vertices_m)
     index = torch.tensor([0, 1] * 4)
     mixed = batch._replace(target=batch.target._replace(object_index=index))
-    with OnPolicyHypotheses(small(*OWN), {7: twice, 3: mesh}) as own:
+    with OnPolicyHypotheses(small(*OWN), {7: twice, 3: centred}) as own:
         after = own(Moves(), mixed, step=0)
     T, K = after.inputs.T_cam_obj, after.inputs.K_crop
-    across = K[:, 0, 0] * mesh.diameter_m / (T[:, :3, :3] @ torch.from_numpy(mesh.center_m).float() + T[:, :3, 3])[:, 2]
+    across = K[:, 0, 0] * centred.diameter_m / (T[:, :3, :3] @ torch.from_numpy(centred.center_m).float() + T[:, :3, 3])[:, 2]
     assert across[index == 0].numpy() == pytest.approx(64 / 1.5, rel=0.02)
     assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)
 
