@@ -16,7 +16,7 @@ from posecore.errors import MeshError, TextureError
 from posecore.mesh_files.images import DecodedImage, beside, decode, linked_bytes, missing
 from posecore.mesh_files.mtl import HOLE, NEARLY_OPAQUE, MaterialMap, MtlMaterial, read_materials
 from posecore.mesh_files.part import MeshPart, Texture, decoded, to_bytes, two_looks
-from posecore.mesh_files.polygons import concave, ears, fingerprints, repeated
+from posecore.mesh_files.polygons import concave, ears, polygon_fingerprints, repeated
 
 log = logging.getLogger(__name__)
 
@@ -283,7 +283,7 @@ def _plain_polygons(file: Path, text: str) -> str:
         words = polygons[kept[j]]
         triangles = ears(corners[starts[j] : starts[j + 1]])
         changes[j] = "\n".join("f " + " ".join(words[k] for k in triangle) for triangle in triangles)
-    for copy, original in repeated(fingerprints(corners, sizes)):
+    for copy, original in repeated(polygon_fingerprints(corners, sizes)):
         materials = {text.rfind("\nusemtl ", 0, lines[kept[j]].start()) for j in (copy, original)}
         if len({text[at : text.find("\n", at + 1)] if at >= 0 else "" for at in materials}) > 1:
             raise MeshError(two_looks(file))
