@@ -165,6 +165,8 @@ def _part(file: Path, primitive: Mapping[str, Any], buffers: Buffers, materials:
     rgb = base.factor
     if "COLOR_0" in attributes:
         colours = buffers.values(attributes["COLOR_0"])
+        if not np.isfinite(colours).all():
+            raise MeshError(f"{file}: a vertex colour is not a finite number; export the mesh again")
         materials.refuse_see_through(primitive.get("material"), colours)
         rgb = colours[:, :3] * rgb
     uv = None
