@@ -147,6 +147,27 @@ def test_nodes_place_parts_and_a_mirroring_keeps_the_outside(tmp_path: Path) -> 
     np.testing.assert_allclose(mesh.normals, [[0, 0, 1]] * 4, atol=1e-7)
 
 
+def test_hidden_nodes_are_left_out(tmp_path: Path) -> None:
+    def build(made: Gltf) -> None:
+        made.square()
+        made.square(node={"extensions": {"KHR_node_visibility": {"visible": False}}})
+
+    assert len(load_mesh(gltf(build, left=False)(tmp_path)).faces) == 2
+
+
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+def test_normals_that_are_none_are_made(tmp_path: Path, value: float) -> None:
+    mesh = loaded(tmp_path, "ply", CUBE, QUADS.tolist())
+    text = (tmp_path / "mesh.ply").read_text().replace("element face", "property float nx\nelement face")
+    text = text.replace("property float nx\n", "".join(f"property float n{axis}\n" for axis in "xyz"))
+    rows = [" ".join(map(str, vertex)) for vertex in CUBE]
+    text = text.replace("\n".join(rows), "\n".join(f"{row} {value} {value} {value}" for row in rows))
+    (tmp_path / "mesh.ply").write_text(text)
+    again = load_mesh(tmp_path / "mesh.ply")
+    assert not again.has_normals
+    np.testing.assert_array_equal(again.normals, mesh.normals)
+
+
 def test_strips_fans_and_lists_are_the_same_square(tmp_path: Path) -> None:
     digests = set()
     for mode, order in ((5, [0, 1, 3, 2]), (6, [0, 1, 2, 3]), (4, [0, 1, 2, 0, 2, 3])):

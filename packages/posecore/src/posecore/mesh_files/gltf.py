@@ -28,7 +28,7 @@ HONOURED = (
     "EXT_texture_webp", "KHR_lights_punctual", "KHR_materials_clearcoat", "KHR_materials_specular", "KHR_materials_ior",
     "KHR_materials_sheen", "KHR_materials_emissive_strength", "KHR_materials_iridescence", "KHR_materials_anisotropy",
     "KHR_materials_variants", "KHR_materials_transmission", "KHR_materials_volume",
-    "KHR_xmp_json_ld", "KHR_animation_pointer",
+    "KHR_node_visibility", "KHR_xmp_json_ld", "KHR_animation_pointer",
 )  # fmt: skip
 """Extensions that a file may require: read, or without effect on shape and base colour."""
 SHAPE_EXTENSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression")
@@ -112,6 +112,8 @@ def _nodes(file: Path, tree: Mapping[str, Any]) -> Iterator[tuple[Mapping[str, A
     while stack:
         index, above, depth = stack.pop()
         node = nodes[index]
+        if not node.get("extensions", {}).get("KHR_node_visibility", {}).get("visible", True):
+            continue
         if depth > _MOST_DEPTH:
             raise MeshError(f"{file}: its nodes are nested deeper than {_MOST_DEPTH}; a node is its own parent")
         if node.get("extensions", {}).get("EXT_mesh_gpu_instancing") is not None:
@@ -163,6 +165,8 @@ def _part(file: Path, primitive: Mapping[str, Any], buffers: Buffers, materials:
     rgb = base.factor
     if "COLOR_0" in attributes:
         colours = buffers.values(attributes["COLOR_0"])
+        if not np.isfinite(colours).all():
+            raise MeshError(f"{file}: a vertex colour is not a finite number; export the mesh again")
         materials.refuse_see_through(primitive.get("material"), colours)
         rgb = colours[:, :3] * rgb
     uv = None

@@ -16,7 +16,8 @@ from posecore.mesh_files.images import beside, linked_bytes, missing
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_MOST_VALUES = 1 << 31
+_MOST_ZEROS = 1 << 24
+"""Values of an accessor that has no data of its own."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -88,7 +89,7 @@ class Buffers:
     def _buffer(self, number: int) -> bytes:
         if number not in self._loaded:
             uri = self.tree["buffers"][number].get("uri")
-            if uri is None and self.blob is None:
+            if uri is None and (self.blob is None or number > 0):
                 raise MeshError(f"{self.file}: its buffer {number} has no data; export it again")
             self._loaded[number] = self.blob or b"" if uri is None else self.linked(uri, "buffer")[0]
         return self._loaded[number]
@@ -97,15 +98,15 @@ class Buffers:
         entry = self.tree["accessors"][accessor]
         count, width = entry["count"], _WIDTHS[entry["type"]]
         dtype = np.dtype(_TYPES[entry["componentType"]])
-        if not 0 <= count * width < _MOST_VALUES:
-            raise MeshError(f"{self.file}: accessor {accessor} has {count} elements; export it again")
         if "bufferView" in entry:
             stride = self.tree["bufferViews"][entry["bufferView"]].get("byteStride")
             array = self._strided(
                 accessor, entry["bufferView"], entry.get("byteOffset", 0), (count, width), dtype, stride
             )
-        else:
+        elif 0 <= count * width <= _MOST_ZEROS:
             array = np.zeros((count, width), dtype)
+        else:
+            raise MeshError(f"{self.file}: accessor {accessor} has {count} elements and no data; export it again")
         if "sparse" in entry:
             sparse = entry["sparse"]
             positions, changed = sparse["indices"], sparse["values"]
@@ -130,7 +131,7 @@ class Buffers:
         data = self.view(view)
         row = shape[1] * dtype.itemsize
         step = stride or row
-        if step < row or offset < 0 or (shape[0] and offset + (shape[0] - 1) * step + row > len(data)):
+        if shape[0] < 0 or step < row or offset < 0 or (shape[0] and offset + (shape[0] - 1) * step + row > len(data)):
             raise MeshError(f"{self.file}: accessor {accessor} reaches beyond its buffer view; export it again")
         if not shape[0]:
             return np.zeros(shape, dtype)

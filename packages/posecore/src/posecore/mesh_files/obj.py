@@ -16,7 +16,7 @@ from posecore.errors import MeshError, TextureError
 from posecore.mesh_files.images import DecodedImage, beside, decode, linked_bytes, missing
 from posecore.mesh_files.mtl import HOLE, NEARLY_OPAQUE, MaterialMap, MtlMaterial, read_materials
 from posecore.mesh_files.part import MeshPart, Texture, decoded, to_bytes, two_looks
-from posecore.mesh_files.polygons import concave, ears, fingerprints, repeated
+from posecore.mesh_files.polygons import concave, ears, polygon_fingerprints, repeated
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +42,7 @@ def read_obj(file: Path, data: bytes, *, allow_missing_textures: bool = False) -
     """
     text = _one_spelling(decoded(data))
     _refuse_cut(file, text, data)
+    _refuse_half_coloured(file, text)
     text, names = _numbered_materials(text)
     libraries = re.findall(r"^mtllib +(.+)$", text, re.MULTILINE | re.IGNORECASE)
     materials = _materials(file, list(dict.fromkeys(libraries)), names, allow_missing_textures)
@@ -56,7 +57,7 @@ def read_obj(file: Path, data: bytes, *, allow_missing_textures: bool = False) -
         number = re.fullmatch(r"m(\d+)", str(getattr(getattr(visual, "material", None), "name", "")))
         material = materials.get(int(number[1])) if number else None
         uv = None if visual is None or visual.uv is None else np.asarray(visual.uv, np.float64)
-        colours = _vertex_colours(entry.get("vertex_colors"), len(mesh.vertices))
+        colours = _vertex_colours(file, entry.get("vertex_colors"), len(mesh.vertices))
         has_normals = "vertex_normals" in entry
         part = MeshPart(
             vertices=np.asarray(mesh.vertices, np.float64),
@@ -230,10 +231,18 @@ def _refuse_holes(file: Path, material: MtlMaterial) -> None:
         )
 
 
-def _vertex_colours(values: Any, count: int) -> UInt8[np.ndarray, "v 3"] | None:
+def _refuse_half_coloured(file: Path, text: str) -> None:
+    """Refuse colours of some vertices alone, which trimesh would leave out for all."""
+    if re.search(r"^v(?: +\S+){6}", text, re.MULTILINE) and re.search(r"^v(?: +\S+){3,4} *$", text, re.MULTILINE):
+        raise MeshError(f"{file}: only some of its vertices have colours; give each a colour or none")
+
+
+def _vertex_colours(file: Path, values: Any, count: int) -> UInt8[np.ndarray, "v 3"] | None:
     if values is None or len(values) != count:
         return None
     colours = np.asarray(values, np.float64)
+    if not np.isfinite(colours).all():
+        raise MeshError(f"{file}: a vertex colour is not a finite number; export the mesh again")
     return to_bytes(colours / (255.0 if colours.max(initial=0.0) > 1.0 else 1.0))
 
 
@@ -283,7 +292,7 @@ def _plain_polygons(file: Path, text: str) -> str:
         words = polygons[kept[j]]
         triangles = ears(corners[starts[j] : starts[j + 1]])
         changes[j] = "\n".join("f " + " ".join(words[k] for k in triangle) for triangle in triangles)
-    for copy, original in repeated(fingerprints(corners, sizes)):
+    for copy, original in repeated(polygon_fingerprints(corners, sizes)):
         materials = {text.rfind("\nusemtl ", 0, lines[kept[j]].start()) for j in (copy, original)}
         if len({text[at : text.find("\n", at + 1)] if at >= 0 else "" for at in materials}) > 1:
             raise MeshError(two_looks(file))

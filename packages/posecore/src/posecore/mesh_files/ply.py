@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from trimesh.exchange.ply import load_ply
+from trimesh.grouping import unique_rows
 from trimesh.visual import texture as trimesh_texture
 
 from posecore.errors import MeshError
@@ -285,9 +286,10 @@ def _textured(
         if wedge.ndim != 2 or wedge.shape[1] != 6 or len(wedge) != len(part.faces):
             raise MeshError(f"{file}: has texture coordinates of polygons' corners; triangulate the mesh")
         corners = wedge.reshape(-1, 2).astype(np.float64)
-        unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+        unique: Any = unique_rows
+        rows, inverse = unique(corners)  # trimesh orders the vertices by it, and hashes hang on that
         faces, of_vertex, of_uv = _unmerged(part.faces, inverse.reshape(part.faces.shape))
-        part = _picked(part, of_vertex, faces, unique[of_uv])
+        part = _picked(part, of_vertex, faces, corners[rows][of_uv])
     elif vertex_uv is not None:
         part = replace(part, uv=vertex_uv.astype(np.float64))
     else:

@@ -27,13 +27,17 @@ def concave(corners: Float[np.ndarray, "c 3"], sizes: Int[np.ndarray, " p"]) -> 
     return np.asarray(np.minimum.reduceat(turns, starts) < -slack)
 
 
-def fingerprints(corners: Float[np.ndarray, "c 3"], sizes: Int[np.ndarray, " p"]) -> UInt64[np.ndarray, " p"]:
-    """A number for each polygon that only depends on the positions of its corners, not on their order."""
-    bits = np.ascontiguousarray(corners + 0.0).view(np.uint64)  # + 0.0 makes -0.0 a 0.0
+def fingerprints(points: Float[np.ndarray, "c 3"]) -> UInt64[np.ndarray, " c"]:
+    """A number for each point that only depends on its position; a polygon's is the sum, whatever the order."""
+    bits = np.ascontiguousarray(points + 0.0).view(np.uint64)  # + 0.0 makes -0.0 a 0.0
     weights = np.array([3, 5, 7], np.uint64)
-    mixed = _mixed((_mixed(bits) * weights).sum(axis=1, dtype=np.uint64))
+    return _mixed((_mixed(bits) * weights).sum(axis=1, dtype=np.uint64))
+
+
+def polygon_fingerprints(corners: Float[np.ndarray, "c 3"], sizes: Int[np.ndarray, " p"]) -> UInt64[np.ndarray, " p"]:
+    """A number for each polygon that only depends on the positions of its corners, not on their order."""
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
-    return np.asarray(np.add.reduceat(mixed, starts))
+    return np.asarray(np.add.reduceat(fingerprints(corners), starts))
 
 
 def _mixed(x: UInt64[np.ndarray, "*n"]) -> UInt64[np.ndarray, "*n"]:
@@ -45,6 +49,9 @@ def _mixed(x: UInt64[np.ndarray, "*n"]) -> UInt64[np.ndarray, "*n"]:
 
 def repeated(numbers: UInt64[np.ndarray, " p"]) -> Int[np.ndarray, "r 2"]:
     """Rows whose number an earlier row has, each with the first such row."""
+    ordered = np.sort(numbers)
+    if (ordered[1:] != ordered[:-1]).all():
+        return np.zeros((0, 2), np.int64)
     order = np.argsort(numbers, kind="stable")
     is_new = np.concatenate([[True], numbers[order][1:] != numbers[order][:-1]])
     first = order[np.flatnonzero(is_new)[np.cumsum(is_new) - 1]]
@@ -94,7 +101,7 @@ def triangles_of(
     sizes = np.array([len(polygons[i]) for i in whole])
     corners = np.concatenate([np.asarray(polygons[i], np.int64) for i in whole])
     is_concave = concave(vertices[corners], sizes) & (sizes > 3)
-    copies = set(repeated(fingerprints(vertices[corners], sizes))[:, 0].tolist())
+    copies = set(repeated(polygon_fingerprints(vertices[corners], sizes))[:, 0].tolist())
     if not is_concave.any() and not any(sizes[copy] > 3 for copy in copies):
         return _in_trimesh_order([np.asarray(polygons[i], np.int64) for i in whole], np.array(whole))
     faces, sources = [], []

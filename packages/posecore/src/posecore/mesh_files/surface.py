@@ -36,6 +36,7 @@ def joined(file: Path, parts: list[MeshPart]) -> Surface:
     if not parts:
         raise MeshError(f"{file}: no faces; a triangle mesh is needed, not a point cloud")
     _refuse_bad_vertices(file, parts)
+    parts = [part if _has_normals(part) else replace(part, normals=None) for part in parts]
     parts = _without_duplicates(file, parts)
     if needs_atlas(parts):
         parts = with_atlas(file, parts)
@@ -67,7 +68,7 @@ def joined(file: Path, parts: list[MeshPart]) -> Surface:
 
 
 def _refuse_bad_vertices(file: Path, parts: list[MeshPart]) -> None:
-    start, area = 0, 0.0
+    start, has_area = 0, False
     for part in parts:
         finite = np.isfinite(part.vertices).all(axis=1)
         if not finite.all():
@@ -85,10 +86,14 @@ def _refuse_bad_vertices(file: Path, parts: list[MeshPart]) -> None:
         if part.uv is not None and not np.isfinite(part.uv).all():
             raise MeshError(f"{file}: a texture coordinate is not a finite number; export the mesh again")
         start += len(part.vertices)
-        a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-        area += float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    if not area > 0:
+        blocks = range(0, len(part.faces), 10000)  # the first holds an area, if it is a surface
+        has_area = has_area or any(_has_area(part.vertices[part.faces[i : i + 10000]]) for i in blocks)
+    if not has_area:
         raise MeshError(f"{file}: its faces have no area; export the surface, not points or lines")
+
+
+def _has_area(corners: Float[np.ndarray, "f 3 3"]) -> bool:
+    return bool(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).any())
 
 
 def _colours(parts: list[MeshPart], default: int) -> UInt8[np.ndarray, "v 3"] | None:
@@ -106,8 +111,8 @@ def _without_duplicates(file: Path, parts: list[MeshPart]) -> list[MeshPart]:
     Raises:
         MeshError: Faces on each other look different: which is seen would be chance.
     """
-    corners = np.concatenate([part.vertices[part.faces].reshape(-1, 3) for part in parts])
-    copies = repeated(fingerprints(corners, np.full(len(corners) // 3, 3)))
+    numbers = [fingerprints(part.vertices)[part.faces].sum(axis=1, dtype=np.uint64) for part in parts]
+    copies = repeated(np.concatenate(numbers))
     if not len(copies):
         return parts
     part_of = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
@@ -118,7 +123,7 @@ def _without_duplicates(file: Path, parts: list[MeshPart]) -> list[MeshPart]:
             a, face - int(starts[part_of[face]]), b, original - int(starts[part_of[original]])
         ):
             raise MeshError(two_looks(file))
-    kept = np.ones(len(corners) // 3, bool)
+    kept = np.ones(starts[-1], bool)
     kept[copies[:, 0]] = False
     remaining = [
         MeshPart(**{**part.__dict__, "faces": part.faces[kept[starts[i] : starts[i + 1]]]})
@@ -132,6 +137,11 @@ def _same_colours(a: MeshPart, face: int, b: MeshPart, original: int) -> bool:
         return np.full(3, -1.0) if part.rgb is None else part.rgb[part.faces[row]].mean(axis=0)
 
     return bool(np.abs(mean(a, face) - mean(b, original)).max() < 2.0)
+
+
+def _has_normals(part: MeshPart) -> bool:
+    """Whether the file has normals that can be used; some exporters write zeros or NaN for none."""
+    return part.normals is not None and bool(np.isfinite(part.normals).all()) and bool(part.normals.any())
 
 
 def _with_normals(part: MeshPart) -> MeshPart:
