@@ -105,7 +105,8 @@ def make_dataset(
     card: Mapping[str, Any] = {
         "n": n, "shard_size": shard_size, "patch_px": patch_px, "contour_points": contour_points, "seed": 0,
         "depth_step_m": 1e-4,
-        "config": {}, "camera": {"width_px": 640, "height_px": 480, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
+        "config": {},
+        "camera": {"width_px": 640, "height_px": 480, "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]},
         "objects": {
             "1": {
                 "name": "thing", "path": "models/obj_000001.ply", "sha256": "",
