@@ -13,6 +13,7 @@ from posecore.command_line import (
     progress_bar,
     renamed_arguments,
     renamed_options,
+    start_logging,
     stoppable,
     verbose_option,
 )
@@ -168,3 +169,62 @@ def test_positional_arguments_of_earlier_versions_are_refused_with_their_options
     assert text in refused.stderr
     assert CliRunner().invoke(check, ["--dataset", "lmo"]).output == "lmo\n"
     assert "Usage: check [OPTIONS]" in CliRunner().invoke(check, ["--help"]).output
+
+
+@main.command()
+@click.argument("path", type=click.Path(path_type=str), required=False)
+@click.option("--count", type=click.IntRange(0))
+@click.option("--ratio", type=click.FloatRange(0))
+@click.option("--set", "assignments", multiple=True)
+@click.option("--fail")
+def values(path, count, ratio, assignments, fail):
+    if fail:
+        raise ConfigError(f"{fail}: is wrong")
+    click.echo(f"{path} {count} {ratio} {assignments}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        ([""], "an argument: the value is empty, expected one; leave it out for the default"),
+        (["--count", ""], "--count: the value is empty"),
+        (["--count="], "--count: the value is empty"),
+        (["--count", "9" * 400], "Invalid value for '--count': the number has more than 64 bits"),
+        (["--count", "9" * 5000], "Invalid value for '--count'"),
+        (["--ratio", "1e400"], "Invalid value for '--ratio': found inf, expected a finite number"),
+        (["--ratio", "nan"], "Invalid value for '--ratio': found nan, expected a finite number"),
+        (["--ratio", "9" * 400], "Invalid value for '--ratio': found inf, expected a finite number"),
+        (["--fail", "\x1b[31m"], "Error: \\x1b[31m: is wrong"),
+        (["--fail", "a\nError: b"], "Error: a\\x0aError: b: is wrong"),
+        (["--fail", "x" * 100_000], "x..."),
+        (["--fail", "\udcff\u202e"], "Error: \\xff\\u202e: is wrong"),
+        (["--\x1b[2J"], "No such option '--\\x1b[2J'"),
+    ],
+    ids=lambda value: str(value)[:30].encode("unicode_escape").decode(),
+)
+def test_values_that_no_command_takes_are_one_printable_line(arguments, line):
+    result = run("values", *arguments)
+    assert result.exit_code == 2
+    (error,) = [text for text in result.stderr.splitlines() if text.startswith("Error: ")]
+    assert line in error
+    assert error.isprintable()
+    assert len(error) < 2100
+
+
+def test_an_unknown_command_is_printable():
+    result = run("\x1b[31mred")
+    assert result.exit_code == 2
+    assert "\x1b" not in result.stderr
+    assert "\\x1b[31mred" in result.stderr
+
+
+def test_values_that_commands_take_pass():
+    taken = run("values", "--set", "key=", "--set=a=b", "--count", str(2**63 - 1))
+    assert taken.stdout.startswith("None 9223372036854775807")
+
+
+def test_log_lines_are_printable(monkeypatch, capsys):
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    start_logging("a_program", verbose=False)
+    logging.getLogger("a_program").warning("%s", "\x1b[2J\nWARNING forged")
+    assert capsys.readouterr().err == "WARNING a_program: \\x1b[2J\\x0aWARNING forged\n"

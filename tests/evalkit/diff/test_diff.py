@@ -256,8 +256,9 @@ def test_a_report_table_of_several_files_needs_their_names(tmp_path):
     assert "no result file 'coarse'; it holds start, fine" in result.stderr
 
 
-def test_the_table_of_a_report_reads_back_as_it_was(dataset, perfect, tmp_path):
-    path = tmp_path / "perfect.csv"
+@pytest.mark.parametrize("name", ["perfect", "=SUM(1)"])
+def test_the_table_of_a_report_reads_back_as_it_was(dataset, perfect, tmp_path, name):
+    path = tmp_path / f"{name}.csv"
     write_results(path, perfect[:-1])
     with open_sides((path, path), dataset=dataset.root) as both:
         written = tmp_path / "estimates.csv"
@@ -265,6 +266,8 @@ def test_the_table_of_a_report_reads_back_as_it_was(dataset, perfect, tmp_path):
         table = both.a.table
     with open_sides((written, written)) as both:
         assert both.evaluator is None
+        assert both.a.name == f"{name} (A)"
+        assert written.read_text().splitlines()[1].startswith(f"'{name}," if name.startswith("=") else f"{name},")
         read = both.a.table[table.columns]
         pd.testing.assert_frame_equal(read, table.reset_index(drop=True), rtol=1e-8, atol=1e-12)
 

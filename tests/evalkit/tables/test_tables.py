@@ -5,6 +5,7 @@ import io
 import json
 
 import pytest
+from evalkit.tables import csv_cells
 from evalkit.tables.latex import latex, latex_text
 from evalkit.tables.markdown import markdown
 from evalkit.tables.model import Interval, Row, Table, TableColumn, best_cells, cell_text
@@ -208,3 +209,21 @@ def test_several_tables_are_one_document_but_several_csv_files(tmp_path):
 def test_an_unknown_suffix_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"out\.docx: found suffix '\.docx', expected one of \.md, \.tex"):
         write_tables(tmp_path / "out.docx", [table_of()])
+
+
+FORMULAS = ["=HYPERLINK(1)", "+1+1", "-cmd|x", "@SUM(1)", "\t=1", "'=1", "'"]
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_a_name_in_a_csv_is_no_formula(name):
+    cell = csv_cells.escaped(name)
+    assert cell == "'" + name
+    assert csv_cells.unescaped(cell) == name
+    (line,) = list(csv.reader(io.StringIO(csv_text(table_of(row(name), columns=(METHOD,))))))[1:]
+    assert line == [cell]
+
+
+@pytest.mark.parametrize("text", ["lmo", "a=b", "-0.5", "+1e3", "", "it's"])
+def test_other_cells_of_a_csv_stay(text):
+    assert csv_cells.escaped(text) == text
+    assert csv_cells.unescaped(text) == text

@@ -225,7 +225,7 @@ def test_an_optimiser_state_that_lacks_something_is_named(run, dataset, tmp_path
     shutil.copytree(run[0], out)
     (state,) = out.glob("optimiser-*.pt")
     torch.save({"optimiser": {}}, state)
-    with pytest.raises(CheckpointError, match=rf"{state.name}: holds no best_mm, so the run cannot be resumed"):
+    with pytest.raises(CheckpointError, match=rf"{state.name}: the key optimiser.state is missing; the run"):
         train(small(), str(dataset), out, resume=True)
 
 

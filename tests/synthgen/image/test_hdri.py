@@ -1,4 +1,5 @@
 import math
+import os
 from dataclasses import replace
 
 import cv2
@@ -227,3 +228,27 @@ def test_light_and_background_agree_in_cycles(tmp_path):
     fresh.close()
     engine.close()
     assert [len(x) for x in (bpy.data.worlds, bpy.data.images)] == before
+
+
+@pytest.mark.parametrize("suffix", ["hdr", "exr"])
+def test_a_panorama_that_is_cut_off_or_no_file_is_named(tmp_path, suffix, capfd):
+    write_hdr(tmp_path / "good.hdr", 30, 20)
+    file = tmp_path / f"bad.{suffix}"
+    if suffix == "exr":
+        pixels = np.random.default_rng(0).random((64, 128, 3), np.float32)
+        with OpenEXR.File({"type": OpenEXR.scanlineimage}, {"RGB": OpenEXR.Channel(pixels)}) as made:
+            made.write(str(file))
+    else:
+        noise = np.random.default_rng(0).random((64, 128, 3), np.float32)
+        assert cv2.imwrite(str(file), noise)
+    hdri.list_hdris(tmp_path)
+    data = file.read_bytes()
+    file.write_bytes(data[: len(data) * 2 // 3])
+    with pytest.raises(ConfigError, match=rf"bad\.{suffix}: "):
+        hdri.list_hdris(tmp_path)
+    file.unlink()
+    os.mkfifo(file)
+    with pytest.raises(ConfigError, match=rf"bad\.{suffix}: "):
+        hdri.list_hdris(tmp_path)
+    printed = capfd.readouterr().err
+    assert printed == "" or suffix == "exr"  # OpenEXR's own library prints a line of its own

@@ -94,9 +94,8 @@ def _printable_usage_errors() -> Iterator[None]:
     try:
         yield
     except click.ClickException as error:
-        error.message = printable(error.message, keep="\n\t")
-        if len(error.message) > _LONGEST_LINE:
-            error.message = f"{error.message[:_LONGEST_LINE]}..."
+        text = printable(error.message, keep="\n\t")
+        vars(error)["message"] = text if len(text) <= _LONGEST_LINE else f"{text[:_LONGEST_LINE]}..."
         raise
 
 

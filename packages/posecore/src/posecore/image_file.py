@@ -6,6 +6,7 @@ Photographs, textures and panoramas come through here, and `posecore.bop.images`
 import io
 import re
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -130,7 +131,7 @@ def _size_by_pillow(data: bytes) -> tuple[int, int] | None:
 
     limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None  # it would warn at a third of the limit here
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
             return image.size
     except Exception:  # whatever its parsers meet in a damaged file
         return None

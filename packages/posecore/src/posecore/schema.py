@@ -87,7 +87,9 @@ def shown(value: Any) -> str:
 def _in_words(text: str, content: Any) -> str:
     """An error of msgspec, such as "Expected `int` >= 1 - at `$.n`", with the value that was found."""
     reason, _, path = text.replace("`$", "`").rpartition(" - at `")
-    reason, key = (reason or text).replace("`", ""), path.rstrip("`").lstrip(".")
+    if not reason:  # of the content itself
+        reason, path = text, ""
+    reason, key = reason.replace("`", ""), path.rstrip("`").lstrip(".")
     if (missing := re.fullmatch(r"Object missing required field (.+)", reason)) is not None:
         return f"the key {'.'.join(filter(None, (key, missing[1])))} is missing"
     if not reason.startswith("Expected "):

@@ -92,8 +92,9 @@ def random_direction(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
 
 def is_rotation(R: Float[np.ndarray, "*b 3 3"], tol: float = 1e-3) -> Bool[np.ndarray, "*b"]:
     """Whether R is orthonormal with determinant +1, every entry of R R^T within `tol` of the identity."""
-    residual = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
-    return np.asarray((residual <= tol) & (np.linalg.det(R) > 0))
+    with np.errstate(invalid="ignore", over="ignore"):  # NaN is none
+        residual = np.abs(R @ np.swapaxes(R, -1, -2) - np.eye(3)).max(axis=(-2, -1))
+        return np.asarray((residual <= tol) & (np.linalg.det(R) > 0))
 
 
 def nearest_rotation(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b 3 3"]:

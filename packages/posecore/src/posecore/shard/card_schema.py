@@ -113,7 +113,7 @@ class Card(Struct):
         if isinstance(self.objects, dict):
             if not self.objects or not all(_is_object_id(key) for key in self.objects):
                 raise ValueError(
-                    f"objects has the keys {', '.join(map(repr, list(self.objects)[:9])) or 'of none'}, "
+                    f"objects has the keys {', '.join(map(repr, list(self.objects)[:9])) or 'none'}, "
                     "expected object ids"
                 )
             check_entries("objects", self.objects, ObjectEntry)

@@ -187,6 +187,10 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: missing beside last.safetensors, so the run cannot be resumed; start a new one"
         ) from error
+    except OSError as error:
+        raise CheckpointError(
+            f"{path}: cannot be read ({error.strerror or error}), so the run cannot be resumed; start a new one"
+        ) from error
     except Exception as error:  # torch.load raises whatever its unpickler meets
         raise CheckpointError(
             f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"

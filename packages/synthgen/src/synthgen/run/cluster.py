@@ -120,6 +120,7 @@ def connect(
         with interrupts_ignored():
             cluster = _local(workers, dashboard)
         with cluster, Client(cluster) as client:
+            assert cluster.scheduler is not None
             if dashboard not in (None, cluster.scheduler.http_server.port):  # dask takes another one in silence
                 raise ConfigError(f"--dashboard {dashboard}: this port is taken; give another one")
             yield client
@@ -196,7 +197,8 @@ def _remote(scheduler: str, certificates: Certificates | None) -> Client:
     if certificates is not None and not is_encrypted:
         raise ConfigError(f"--scheduler {scheduler}: expected tls://HOST:PORT with --tls-ca and --tls-cert")
     security = Security() if certificates is None else certificates.security()
-    if is_encrypted and not (security.tls_ca_file and security.tls_client_cert):
+    files = security.get_tls_config_for_role("client")
+    if is_encrypted and not (files["ca_file"] and files["cert"]):
         raise ConfigError(f"--scheduler {scheduler}: needs the certificates --tls-ca and --tls-cert")
     try:
         return Client(scheduler, timeout=ANSWER_S, security=security)
