@@ -153,8 +153,8 @@ def test_nothing_is_printed_before_the_first_visible_task(capsys):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("lmo",), "check ... lmo is now check ... --dataset lmo"),
-        (("lmo", "a.csv", "b.csv"), "is now check ... --dataset lmo --results a.csv --results b.csv"),
+        (("lmo",), "lmo is now --dataset lmo"),
+        (("lmo", "a.csv", "b.csv"), "is now --dataset lmo --results a.csv --results b.csv"),
     ],
 )
 def test_positional_arguments_of_earlier_versions_are_refused_with_their_options(arguments, text):

@@ -53,7 +53,7 @@ def test_a_check_takes_the_dataset_of_the_sidecars_and_refuses_the_arguments_of_
     assert "result files" not in run("check", "--dataset", "toys").output
     refused = run("check", "toys", "truth.csv")
     assert refused.exit_code == 2
-    assert "check ... toys truth.csv is now check ... --dataset toys --results truth.csv" in refused.stderr
+    assert "toys truth.csv is now --dataset toys --results truth.csv" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,9 @@ pytestmark = [
     pytest.mark.skipif(find_chromium() is None, reason="no Chromium on the PATH (Debian: chromium)"),
 ]
 BODY = "tbody:not(.total) tr"
-TABLE = f"[...document.querySelectorAll('table.sortable')].find(t => t.querySelectorAll('{BODY}').length > 2)"
+TABLE = (
+    f"[...document.querySelectorAll('[aria-label^=\"By \"] table')].find(t => t.querySelectorAll('{BODY}').length > 2)"
+)
 NUMBER = "cell => parseFloat((cell.dataset.value ?? cell.textContent).replace('\u2212', '-'))"
 
 

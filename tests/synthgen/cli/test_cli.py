@@ -136,8 +136,8 @@ def test_a_preview_is_spread_over_scenes(tug, config_of, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (("cut", "images", "--out", "a"), "cut ... images is now cut ... --dataset images"),
-        (("export", "shards", "out.h5"), "export ... out.h5 is now export ... --out out.h5"),
+        (("cut", "images", "--out", "a"), "images is now --dataset images"),
+        (("export", "shards", "out.h5"), "out.h5 is now --out out.h5"),
         (("info",), "give SHARDS, or --dataset DIR"),
         (("info", "shards", "--dataset", "images"), "give SHARDS, or --dataset DIR"),
         (("info", "--dataset", "nowhere"), "--dataset nowhere: expected a dataset of `synthgen bop`"),

@@ -160,7 +160,7 @@ def renamed_options(renamed: Mapping[str, str]) -> Callable[[F], F]:
 
 
 def renamed_arguments(*options: str) -> Callable[[F], F]:
-    """Refuse positional arguments of earlier versions: "check lmo a.csv is now check --dataset lmo --results a.csv".
+    """Refuse positional arguments of earlier versions: "lmo a.csv is now --dataset lmo --results a.csv".
 
     Goes below the arguments that the command still has.
 
@@ -171,9 +171,7 @@ def renamed_arguments(*options: str) -> Callable[[F], F]:
     def refuse(ctx: click.Context, _: click.Parameter, values: tuple[str, ...]) -> None:
         if values and not ctx.resilient_parsing:
             new = [f"{options[min(i, len(options) - 1)]} {value}" for i, value in enumerate(values)]
-            raise click.UsageError(
-                f"{ctx.info_name} ... {' '.join(values)} is now {ctx.info_name} ... {' '.join(new)}", ctx
-            )
+            raise click.UsageError(f"{' '.join(values)} is now {' '.join(new)}", ctx)
 
     return click.argument("renamed", nargs=-1, metavar="", is_eager=True, expose_value=False, callback=refuse)
 

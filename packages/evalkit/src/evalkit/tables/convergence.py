@@ -11,8 +11,8 @@ def _fraction_column(key: str, heading: str, group: str, better: Better = "highe
 
 
 FRACTION_COLUMNS = (
-    *(_fraction_column(f"under_{limit:g}deg", f"under {limit:g}°", "rotation") for limit in LIMITS_DEG),
-    *(_fraction_column(f"te_under_{limit:g}d", f"under {limit:g} d", "translation") for limit in LIMITS_DIAMETERS),
+    *(_fraction_column(f"under_{limit:g}deg", f"{limit:g}°", "rotation under") for limit in LIMITS_DEG),
+    *(_fraction_column(f"te_under_{limit:g}d", f"{limit:g} d", "translation under") for limit in LIMITS_DIAMETERS),
     _fraction_column("diverged", "diverged", "", "lower"),
 )
 MEAN_COLUMNS = (
