@@ -38,8 +38,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
 TEST_TIME_ORACLES = {"timm"}
 ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
     "posecore": (
-        "errors renamed se3 files config processes numba_jit ply symmetry diameter mesh simplify window camera "
-        "contour raster store shard bop html command_line"
+        "errors renamed se3 files config processes numba_jit kernels ply symmetry diameter mesh detail simplify window "
+        "camera contour raster store shard bop html command_line"
     ),
     "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (

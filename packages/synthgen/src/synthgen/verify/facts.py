@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from posecore.camera import Camera, intrinsics
 from posecore.contour import contour_mask
+from posecore.detail import with_levels
 from posecore.errors import RenderError, ShardError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
@@ -98,6 +99,8 @@ def load_facts(reader: ShardReader) -> Facts:
             for key in keys:
                 (recipe[group] if group else recipe)[key]
         meshes = load_meshes(reader)
+        if "detail" in card:  # drawn again as the dataset was
+            meshes = {obj_id: with_levels(mesh) for obj_id, mesh in meshes.items()}
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         if isinstance(error, ShardError):
             raise
