@@ -2,9 +2,12 @@
 
 import importlib
 import logging
+import subprocess
+import sys
 
 import click
 import pytest
+from children import started
 from click.testing import CliRunner
 from posecore.command_line import (
     CONTEXT_SETTINGS,
@@ -169,6 +172,34 @@ def test_positional_arguments_of_earlier_versions_are_refused_with_their_options
     assert text in refused.stderr
     assert CliRunner().invoke(check, ["--dataset", "lmo"]).output == "lmo\n"
     assert "Usage: check [OPTIONS]" in CliRunner().invoke(check, ["--help"]).output
+
+
+WORK = """
+import time
+import click
+from posecore.command_line import ErrorReportingGroup, stoppable
+
+@click.group(cls=ErrorReportingGroup)
+def main():
+    pass
+
+@main.command()
+def work():
+    with stoppable(lambda: "half is in out"):
+        print("begun", flush=True)
+        time.sleep(7200)
+
+main()
+"""
+
+
+def test_a_termination_signal_ends_a_command_as_ctrl_c_does():
+    words = [sys.executable, "-c", WORK, "work"]
+    with started(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout.readline() == "begun\n"
+        process.terminate()
+        _, errors = process.communicate()
+    assert (process.returncode, errors) == (130, "Stopped: half is in out\n")
 
 
 @main.command()

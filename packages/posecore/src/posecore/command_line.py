@@ -6,9 +6,12 @@ Errors of the project end a command in one line on stderr with an exit code. Log
 import io
 import logging
 import math
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
@@ -71,7 +74,9 @@ class ErrorReportingGroup(click.Group):
         return name, command, rest
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command."""
+        """Run the command. A termination signal ends it as Ctrl-C does, with its processes and semaphores."""
+        if threading.current_thread() is threading.main_thread():  # as job schedulers and service managers end programs
+            signal.signal(signal.SIGTERM, _interrupt)
         if isinstance(sys.stdout, io.TextIOWrapper):  # a name that is not UTF-8 is printed with escapes
             sys.stdout.reconfigure(errors="backslashreplace")
         try:
@@ -87,6 +92,10 @@ class ErrorReportingGroup(click.Group):
 
             click.echo(error_line(storage_error(error.filename or "storage", error)), err=True)
             ctx.exit(1)
+
+
+def _interrupt(signal_number: int, frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
 
 
 @contextmanager

@@ -68,7 +68,7 @@ def _in_blocks(points: Float[np.ndarray, "v 3"]) -> Float[np.ndarray, "b n 3"]:
         along = np.take_along_axis(blocks, axis[:, None, None], axis=2)[..., 0]
         order = np.argpartition(along, along.shape[1] // 2, axis=1)
         blocks = np.take_along_axis(blocks, order[..., None], axis=1).reshape(2 * len(blocks), -1, 3)
-    return blocks
+    return np.asarray(blocks)
 
 
 def _boxes(blocks: Float[np.ndarray, "b n 3"]) -> list[Boxes]:

@@ -26,6 +26,27 @@ DIAMETER_RANGE_M = (2e-3, 10.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class DetailLevel:
+    """A mesh with fewer faces, relative to the box centre and the diameter of the mesh that it stands for.
+
+    Attributes:
+        offsets: (w, 3) vertices, from the box centre, in diameters.
+        sources: (w,) the vertex of `Mesh.drawn` that has each vertex's colour and normal.
+        faces: (f, 3) vertex indices.
+        rms_error: Distance between the two surfaces, root mean square over both, in diameters.
+        max_error: The largest distance, in diameters.
+        is_closed: See `Mesh.is_closed`.
+    """
+
+    offsets: Float[np.ndarray, "w 3"]
+    sources: Int[np.ndarray, " w"]
+    faces: Int[np.ndarray, "f 3"]
+    rms_error: float
+    max_error: float
+    is_closed: bool
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
     """A triangle mesh in object coordinates. Texture and vertex colours together count as a product in linear light.
 
@@ -39,6 +60,8 @@ class Mesh:
         has_normals: Whether the normals are the file's. Others are smooth, and hard edges come with `drawn`.
         path: Source file.
         sha256: Hash of that file's bytes.
+        levels: Levels of detail, finer ones first, that the rasteriser draws where they suffice; none unless they were
+            made (`posecore.detail.with_levels`). They serve copies that are shifted, scaled or of other colours too.
     """
 
     vertices_m: Float[np.ndarray, "v 3"]
@@ -50,6 +73,7 @@ class Mesh:
     has_normals: bool = True
     path: str = ""
     sha256: str = ""
+    levels: tuple[DetailLevel, ...] = ()
 
     @cached_property
     def diameter_m(self) -> float:
@@ -76,7 +100,39 @@ class Mesh:
 
         It is not the file's mesh any more, so it has no hash.
         """
-        return replace(self, vertices_m=self.vertices_m - point_m, sha256="")
+        copy = replace(self, vertices_m=self.vertices_m - point_m, sha256="")
+        for name in ("diameter_m", "is_closed"):
+            if name in self.__dict__:
+                copy.__dict__[name] = self.__dict__[name]
+        return copy
+
+    def level(self, number: int) -> "Mesh":
+        """The drawn mesh for 0, else one with the vertices and faces of `levels[number - 1]`."""
+        drawn = self.drawn
+        if number == 0:
+            return drawn
+        level = self.levels[number - 1]
+        return Mesh(
+            vertices_m=self.center_m + self.diameter_m * level.offsets.astype(np.float64),
+            faces=level.faces,
+            normals=drawn.normals[level.sources],
+            vertex_rgb=drawn.colours[level.sources],
+        )
+
+    def scaled(self, factor: float) -> "Mesh":
+        """The mesh about its box centre, scaled. It keeps its hash."""
+        copy = replace(self, vertices_m=(self.vertices_m - self.center_m) * factor)
+        copy.__dict__["is_closed"] = self.is_closed
+        return copy
+
+    def recoloured(self, rgb: tuple[int, int, int]) -> "Mesh":
+        """The mesh in one display colour."""
+        vertex_rgb = np.tile(np.array(rgb, np.uint8), (len(self.vertices_m), 1))
+        copy = replace(self, vertex_rgb=vertex_rgb, uv=None, texture_rgb=None)
+        for name in ("diameter_m", "center_m", "is_closed"):
+            if name in self.__dict__:
+                copy.__dict__[name] = self.__dict__[name]
+        return copy
 
     @cached_property
     def colours(self) -> UInt8[np.ndarray, "v 3"]:
@@ -122,19 +178,28 @@ class Mesh:
         Vertices at the same position count as one. Every directed edge must have its opposite, and every connected
         piece must enclose a positive volume.
         """
-        _, merged = np.unique(self.vertices_m.round(9), axis=0, return_inverse=True)
-        faces = merged.reshape(-1)[self.faces]
-        proper = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-        faces, corners_m = faces[proper], self.vertices_m[self.faces[proper]]
-        edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-        n = int(merged.max()) + 1
-        if not np.array_equal(np.sort(edges @ [n, 1]), np.sort(edges @ [1, n])):
-            return False
-        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-        _, piece = connected_components(links, directed=False)
-        volumes = np.einsum("fi,fi->f", corners_m[:, 0], np.cross(corners_m[:, 1], corners_m[:, 2])) / 6.0
-        of_piece = np.bincount(piece[faces[:, 0]], weights=volumes)
-        return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
+        _, first, merged = np.unique(self.vertices_m.round(9), axis=0, return_index=True, return_inverse=True)
+        return encloses_volume(self.vertices_m[first], merged.reshape(-1)[self.faces])
+
+
+def encloses_volume(points_m: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
+    """Whether every directed edge has its opposite, and every connected piece encloses a positive volume.
+
+    Args:
+        points_m: (v, 3) metres, all different.
+        faces: (f, 3) indices; faces with a repeated one do not count.
+    """
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    corners_m = points_m[faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
+    n = len(points_m)
+    if not np.array_equal(np.sort(edges @ [n, 1]), np.sort(edges @ [1, n])):
+        return False
+    links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
+    _, piece = connected_components(links, directed=False)
+    volumes = np.einsum("fi,fi->f", corners_m[:, 0], np.cross(corners_m[:, 1], corners_m[:, 2])) / 6.0
+    of_piece = np.bincount(piece[faces[:, 0]], weights=volumes)
+    return bool((of_piece[np.unique(piece[faces[:, 0]])] > 0).all())
 
 
 def mesh_digest(mesh: Mesh) -> str:

@@ -1,6 +1,6 @@
 """The headless rasteriser: meshes at poses to colour, camera z and masks."""
 
-from posecore.raster.rasteriser import Rasteriser
+from posecore.raster.rasteriser import MAX_PICTURE_INSTANCES, Rasteriser
 from posecore.raster.scene import (
     HEADLIGHT,
     MAX_LIGHTS,
@@ -14,6 +14,7 @@ from posecore.raster.scene import (
 __all__ = [
     "HEADLIGHT",
     "MAX_LIGHTS",
+    "MAX_PICTURE_INSTANCES",
     "DirectionalLight",
     "Instance",
     "Layers",

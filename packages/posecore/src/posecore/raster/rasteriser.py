@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, Literal, ParamSpec, TypeVar
 
 import moderngl
 import numpy as np
@@ -20,9 +20,26 @@ from posecore.errors import RenderError
 from posecore.mesh import Mesh
 from posecore.raster.context import thread_device
 from posecore.raster.scene import HEADLIGHT, MAX_LIGHTS, Instance, Layers, SceneLayers, Shading
-from posecore.raster.shaders import DEPTH_FRAGMENT_SHADER, DEPTH_VERTEX_SHADER, FRAGMENT_SHADER, VERTEX_SHADER
+from posecore.raster.selection import is_in_image, level_number
+from posecore.raster.shaders import (
+    DEPTH_FRAGMENT_SHADER,
+    DEPTH_VERTEX_SHADER,
+    FRAGMENT_SHADER,
+    LABEL_FRAGMENT_SHADER,
+    VERTEX_SHADER,
+)
 
 P, R = ParamSpec("P"), TypeVar("R")
+Kind = Literal["all", "picture", "labels", "depth"]
+"""Attachments of a framebuffer: colour with camera z and instance; colour with the instance as its alpha; camera z and
+instance; camera z."""
+_FORMATS: dict[Kind, tuple[tuple[int, str], ...]] = {
+    "all": ((4, "f1"), (2, "f4")),
+    "picture": ((4, "f1"),),
+    "labels": ((2, "f4"),),
+    "depth": ((1, "f4"),),
+}
+MAX_PICTURE_INSTANCES = 255
 MAX_IMAGES = 64
 """Framebuffers of one image size."""
 MAX_PIXELS = 2048 * 2048
@@ -61,13 +78,16 @@ class Rasteriser:
         self._context = self._device.context
         with self._device.current():
             self._program: Any = self._context.program(vertex_shader=VERTEX_SHADER, fragment_shader=FRAGMENT_SHADER)
+            self._label_program: Any = self._context.program(
+                vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=LABEL_FRAGMENT_SHADER
+            )
             self._depth_program: Any = self._context.program(
                 vertex_shader=DEPTH_VERTEX_SHADER, fragment_shader=DEPTH_FRAGMENT_SHADER
             )
             self._blank = self._context.texture((1, 1), 3, b"\xff\xff\xff")
-        self._arrays: dict[int, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
+        self._arrays: dict[int, dict[int, dict[Kind, Any]]] = {}
         self._textures: dict[int, moderngl.Texture] = {}
-        self._targets: dict[tuple[tuple[int, int], bool], list[moderngl.Framebuffer]] = {}
+        self._targets: dict[tuple[tuple[int, int], Kind], list[moderngl.Framebuffer]] = {}
 
     def __enter__(self) -> "Rasteriser":
         return self
@@ -97,7 +117,7 @@ class Rasteriser:
     @_drawing
     def close(self) -> None:
         """Free everything; nothing can be drawn after that."""
-        for held in (self._program, self._depth_program, self._blank):
+        for held in (self._program, self._label_program, self._depth_program, self._blank):
             held.release()
         for obj_id in list(self._arrays):
             self._release(obj_id)
@@ -136,12 +156,13 @@ class Rasteriser:
         if rgb:
             self._set_shading(shading)
         size = (width_px, height_px)
+        kind: Kind = "all" if rgb else "depth"
         for start in range(0, n, _images_at_once(size)):
             targets = []
             for i in range(start, min(start + _images_at_once(size), n)):
-                targets.append(self._begin(*size, rgb=rgb, index=i - start))
+                targets.append(self._begin(size, kind, i - start))
                 instance = Instance(obj_id=int(obj_ids[i]), T_cam_obj=T_cam_obj[i])
-                self._draw(instance, 0, K[i], *size, self._depth_range_m([instance]), rgb=rgb)
+                self._draw(instance, 0, K[i], size, self._depth_range_m([instance]), kind)
             for i, target in enumerate(targets, start):  # all are drawn before the first is read
                 depth[i] = self._read_floats(target, size, *((1, 2) if rgb else (0, 1)))[..., 0]
                 if colours is not None:
@@ -160,14 +181,51 @@ class Rasteriser:
         shading: Shading = HEADLIGHT,
     ) -> SceneLayers:
         """Draw several objects into one image."""
+        size = (width_px, height_px)
+        target = self._draw_scene(instances, K, size, "all" if rgb else "labels", shading)
+        colours, layer = (
+            self._read_rgb(target, size).copy() if rgb else None,
+            self._read_floats(target, size, int(rgb), 2),
+        )
+        return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
+
+    @_drawing
+    def render_picture(
+        self,
+        instances: Sequence[Instance],
+        K: Float[np.ndarray, "3 3"],
+        width_px: int,
+        height_px: int,
+        *,
+        shading: Shading = HEADLIGHT,
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Int[np.ndarray, "h w"]]:
+        """Colours and instances of `render_scene`, without depths, of which a large picture has many bytes.
+
+        Raises:
+            RenderError: More than 255 instances.
+        """
+        if len(instances) > MAX_PICTURE_INSTANCES:
+            raise RenderError(f"a picture of {len(instances)} objects, expected at most {MAX_PICTURE_INSTANCES}")
+        size = (width_px, height_px)
+        target = self._draw_scene(instances, K, size, "picture", shading)
+        data = target.read(viewport=(0, 0, *size), components=4, attachment=0, alignment=1)
+        layers = np.frombuffer(data, np.uint8).reshape(height_px, width_px, 4)
+        return np.ascontiguousarray(layers[..., :3]), layers[..., 3].astype(np.int16) - 1
+
+    def _draw_scene(
+        self,
+        instances: Sequence[Instance],
+        K: Float[np.ndarray, "3 3"],
+        size: tuple[int, int],
+        kind: Kind,
+        shading: Shading,
+    ) -> moderngl.Framebuffer:
         self._set_shading(shading)
-        target = self._begin(width_px, height_px, rgb=True)
+        target = self._begin(size, kind)
         depth_range_m = self._depth_range_m(instances)  # one for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), width_px, height_px, depth_range_m, rgb=True)
-        size = (width_px, height_px)
-        colours, layer = self._read_rgb(target, size).copy() if rgb else None, self._read_floats(target, size, 1, 2)
-        return SceneLayers(rgb=colours, depth_m=layer[..., 0].copy(), instance=layer[..., 1].astype(np.int16) - 1)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), size, depth_range_m, kind)
+        return target
 
     def _set_shading(self, shading: Shading) -> None:
         program, lights = self._program, shading.lights
@@ -177,23 +235,19 @@ class Rasteriser:
         program["light_direction"].value = [light.direction_cam for light in lights] + padding
         program["light_rgb"].value = [light.rgb for light in lights] + padding
 
-    def _begin(self, width_px: int, height_px: int, *, rgb: bool, index: int = 0) -> moderngl.Framebuffer:
+    def _begin(self, size: tuple[int, int], kind: Kind, index: int = 0) -> moderngl.Framebuffer:
         """A cleared framebuffer, the one that is drawn to from now on.
 
         Each image of a batch has a framebuffer of its own. In a shared one the viewport's offset would move the last
         bits of every interpolated value, so that a pose's render would depend on its index in the batch.
         """
-        size = (width_px, height_px)
-        if (size, rgb) not in self._targets and len(self._targets) >= MAX_SIZES:
+        if (size, kind) not in self._targets and len(self._targets) >= MAX_SIZES:
             for target in self._targets.pop(next(iter(self._targets))):
                 self._free(target)
-        targets = self._targets.setdefault((size, rgb), [])
+        targets = self._targets.setdefault((size, kind), [])
         if index == len(targets):
-            colours = [self._context.texture(size, 4), self._context.texture(size, 2, dtype="f4")]
-            target = self._context.framebuffer(
-                colours if rgb else [self._context.texture(size, 1, dtype="f4")], self._context.depth_texture(size)
-            )
-            targets.append(target)
+            attachments = [self._context.texture(size, n, dtype=dtype) for n, dtype in _FORMATS[kind]]
+            targets.append(self._context.framebuffer(attachments, self._context.depth_texture(size)))
         targets[index].use()
         targets[index].clear(0.0, 0.0, 0.0, 0.0)
         return targets[index]
@@ -203,37 +257,36 @@ class Rasteriser:
         instance: Instance,
         label: int,
         K: Float[np.ndarray, "3 3"],
-        width_px: int,
-        height_px: int,
+        size: tuple[int, int],
         depth_range_m: tuple[float, float],
-        *,
-        rgb: bool,
+        kind: Kind,
     ) -> None:
         mesh = self._mesh(instance.obj_id)
-        coloured, depth_only = self._array(instance.obj_id, mesh)
-        T = se3.with_origin_at(np.asarray(instance.T_cam_obj, np.float64), mesh.center_m)
+        T = np.asarray(instance.T_cam_obj, np.float64)
         center_z_m, near_m = self._center_z_m(instance), depth_range_m[0]
-        if center_z_m + mesh.diameter_m <= near_m:
+        if center_z_m + mesh.diameter_m <= near_m or not is_in_image(mesh, K, T, *size):
             return
+        level = level_number(mesh, K, T)
+        arrays = self._array(instance.obj_id, mesh, level)
         # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
-        if mesh.is_closed and center_z_m - mesh.diameter_m > near_m:
+        is_closed = mesh.levels[level - 1].is_closed if level else mesh.is_closed
+        if is_closed and center_z_m - mesh.diameter_m > near_m:
             self._context.enable(moderngl.CULL_FACE)
         else:
             self._context.disable(moderngl.CULL_FACE)
-        clip = _clip_from_cam(K, width_px, height_px, *depth_range_m)
-        program = self._program if rgb else self._depth_program
-        program["clip_from_cam"].write(clip.T.astype("f4").tobytes())
-        program["cam_from_obj"].write(T.T.astype("f4").tobytes())
-        if not rgb:
-            depth_only.render(moderngl.TRIANGLES)
-            return
-        program["tint"].value = instance.tint
-        program["instance"].value = float(label)
-        texture = self._textures.get(instance.obj_id)
-        program["textured"].value = texture is not None
-        program["coloured"].value = mesh.vertex_rgb is not None
-        (texture or self._blank).use(0)
-        coloured.render(moderngl.TRIANGLES)
+        array = arrays[kind]
+        program = array.program
+        program["clip_from_cam"].write(_clip_from_cam(K, *size, *depth_range_m).T.astype("f4").tobytes())
+        program["cam_from_obj"].write(se3.with_origin_at(T, mesh.center_m).T.astype("f4").tobytes())
+        if kind != "depth":
+            program["instance"].value = float(label)
+        if kind in ("all", "picture"):
+            program["tint"].value = instance.tint
+            texture = self._textures.get(instance.obj_id)
+            program["textured"].value = texture is not None
+            program["coloured"].value = mesh.vertex_rgb is not None
+            (texture or self._blank).use(0)
+        array.render(moderngl.TRIANGLES)
 
     def _read_rgb(self, target: moderngl.Framebuffer, size: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
         width, height = size
@@ -273,37 +326,42 @@ class Rasteriser:
             raise RenderError(f"object {obj_id} has no mesh here; there are meshes for {sorted(self._meshes)}")
         return self._meshes[obj_id]
 
-    def _array(self, obj_id: int, mesh: Mesh) -> tuple[moderngl.VertexArray, moderngl.VertexArray]:
-        """The mesh as the two programs take it, its origin at the centre: with colours, and positions alone."""
-        if obj_id in self._arrays:
-            return self._arrays[obj_id]
-        mesh = mesh.drawn
-        textured = mesh.uv is not None and mesh.texture_rgb is not None
-        uv = np.zeros((len(mesh.vertices_m), 2)) if mesh.uv is None else mesh.uv
-        colours = mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb  # a factor where there is a texture
+    def _array(self, obj_id: int, mesh: Mesh, number: int) -> dict[Kind, Any]:
+        """A level of the mesh as the programs take it, its origin at the centre: with colours, or positions alone."""
+        arrays = self._arrays.setdefault(obj_id, {})
+        if number in arrays:
+            return arrays[number]
+        drawn = mesh.level(number)
+        textured = drawn.uv is not None and drawn.texture_rgb is not None
+        uv = np.zeros((len(drawn.vertices_m), 2)) if drawn.uv is None else drawn.uv
+        colours = drawn.colours if drawn.vertex_rgb is None else drawn.vertex_rgb  # a factor where there is a texture
         # About the centre: float32 has no digits to spare for an origin that lies metres off.
-        about_center_m = mesh.vertices_m - mesh.center_m
-        vertices = np.hstack([about_center_m, mesh.normals, colours / 255.0, uv]).astype("f4")
+        about_center_m = drawn.vertices_m - mesh.center_m
+        vertices = np.hstack([about_center_m, drawn.normals, colours / 255.0, uv]).astype("f4")
         layout = (self._context.buffer(vertices.tobytes()), "3f 3f 3f 2f", "position", "normal", "colour", "uv")
         positions = (self._context.buffer(np.ascontiguousarray(vertices[:, :3]).tobytes()), "3f", "position")
-        index = self._context.buffer(mesh.faces.astype("i4").tobytes())
-        self._arrays[obj_id] = (
-            self._context.vertex_array(self._program, [layout], index),
-            self._context.vertex_array(self._depth_program, [positions], index),
-        )
+        index = self._context.buffer(drawn.faces.astype("i4").tobytes())
+        coloured = self._context.vertex_array(self._program, [layout], index)
+        arrays[number] = {
+            "all": coloured,
+            "picture": coloured,
+            "labels": self._context.vertex_array(self._label_program, [positions], index),
+            "depth": self._context.vertex_array(self._depth_program, [positions], index),
+        }
         if textured:
-            assert mesh.texture_rgb is not None
-            height, width = mesh.texture_rgb.shape[:2]
-            flipped = np.ascontiguousarray(mesh.texture_rgb[::-1])  # GL's first row is the bottom one
+            assert drawn.texture_rgb is not None
+            height, width = drawn.texture_rgb.shape[:2]
+            flipped = np.ascontiguousarray(drawn.texture_rgb[::-1])  # GL's first row is the bottom one
             texture = self._context.texture((width, height), 3, flipped.tobytes(), alignment=1)
             texture.build_mipmaps()
             texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._textures[obj_id] = texture
-        return self._arrays[obj_id]
+        return arrays[number]
 
     def _release(self, obj_id: int) -> None:
         texture = self._textures.pop(obj_id, None)
-        for held in (*self._arrays.pop(obj_id, ()), *([] if texture is None else [texture])):
+        arrays = {array for level in self._arrays.pop(obj_id, {}).values() for array in level.values()}
+        for held in (*arrays, *([] if texture is None else [texture])):
             held.release()
 
     def _free(self, target: moderngl.Framebuffer) -> None:

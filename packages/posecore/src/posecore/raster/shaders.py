@@ -1,4 +1,4 @@
-"""GLSL of the rasteriser: colour, camera z and instance; or camera z alone."""
+"""GLSL of the rasteriser: colour, camera z and instance; camera z and instance; or camera z alone."""
 
 VERTEX_SHADER = """
 #version 330
@@ -56,7 +56,7 @@ void main() {
     for (int i = 0; i < n_lights; ++i) light += diffuse * light_rgb[i] * max(dot(n, light_direction[i]), 0.0);
     vec3 own = textured ? texture(image, texcoord).rgb : base;
     if (textured && coloured) own = display(linear(own) * linear(base));
-    rgb = vec4(min(own * tint * light, 1.0), 1.0);
+    rgb = vec4(min(own * tint * light, 1.0), instance / 255.0);
     depth_instance = vec2(p_cam.z, instance);
 }
 """
@@ -80,4 +80,12 @@ DEPTH_FRAGMENT_SHADER = """
 in float z_cam;
 layout(location = 0) out float depth;
 void main() { depth = z_cam; }
+"""
+
+LABEL_FRAGMENT_SHADER = """
+#version 330
+uniform float instance;
+in float z_cam;
+layout(location = 0) out vec2 depth_instance;
+void main() { depth_instance = vec2(z_cam, instance); }
 """

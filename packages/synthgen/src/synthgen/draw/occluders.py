@@ -31,8 +31,7 @@ def scaled_meshes(
     shapes = []
     for i in indices:
         size_m = diameter_m * rng.uniform(*config.size_diameter)
-        vertices = (meshes[i].vertices_m - meshes[i].center_m) * (size_m / meshes[i].diameter_m)
-        shapes.append(replace(meshes[i], vertices_m=vertices))
+        shapes.append(meshes[i].scaled(size_m / meshes[i].diameter_m))
     return shapes
 
 

@@ -6,11 +6,18 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from posecore.camera import back_project, crop_K
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
-from posecore.raster import MAX_LIGHTS, DirectionalLight, Instance, Rasteriser, SceneLayers, Shading
+from posecore.raster import (
+    MAX_LIGHTS,
+    MAX_PICTURE_INSTANCES,
+    DirectionalLight,
+    Instance,
+    Rasteriser,
+    Shading,
+)
 from posecore.se3 import apply, inverse
 from posecore.window import Window
 
@@ -41,8 +48,7 @@ class RasterEngine:
             self._centers_m[key] = mesh.center_m
             centred = mesh.with_origin_at(mesh.center_m)
             self._rasteriser.add(key, centred)
-            white = np.full((len(mesh.vertices_m), 3), 255, np.uint8)
-            self._rasteriser.add(_WHITE_KEY + key, replace(centred, vertex_rgb=white, uv=None, texture_rgb=None))
+            self._rasteriser.add(_WHITE_KEY + key, centred.recoloured((255, 255, 255)))
 
     def render(self, scene: Scene) -> RenderedScene:
         """Render `scene.region_px`: colour with 2 x 2 samples per pixel, depth and index at the pixel centres."""
@@ -63,9 +69,16 @@ class RasterEngine:
         fine_K = np.diag([_SUPERSAMPLING, _SUPERSAMPLING, 1.0]) @ K
         size = (width * _SUPERSAMPLING, height * _SUPERSAMPLING)
         shading = _shading(scene)
-        fine = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
+        depth_m = None
+        if any(o.material.pattern for o in scene.objects) or len(instances) > MAX_PICTURE_INSTANCES:
+            layers = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
+            rgb, index, depth_m = layers.rgb, layers.instance, layers.depth_m
+        else:  # only a pattern depends on the depth of each sample
+            rgb, index = self._rasteriser.render_picture(instances, fine_K, *size, shading=shading)
+        assert rgb is not None
+        _recolour(rgb, index, depth_m, scene, fine_K)
         exact = self._rasteriser.render_scene(instances, K, width, height, rgb=False)
-        rgb_linear, alpha = _resolve(linear_from_display(_recolour(fine, scene, fine_K)), fine.instance >= 0)
+        rgb_linear, alpha = _resolve(linear_from_display(rgb), index >= 0)
         return RenderedScene(
             rgb_linear=rgb_linear, alpha=alpha, depth_m=exact.depth_m, index=exact.instance.astype(np.int16)
         )
@@ -110,22 +123,26 @@ def _display_factor(rgb: Vector, scale: float) -> Vector:
     return (r, g, b)
 
 
-def _recolour(layers: SceneLayers, scene: Scene, K: Float[np.ndarray, "3 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Apply each material's pattern, or its hue, saturation and value, to the pixels of its object."""
-    rgb = layers.rgb
-    assert rgb is not None
+def _recolour(
+    rgb: UInt8[np.ndarray, "h w 3"],
+    index: Int[np.ndarray, "h w"],
+    depth_m: Float[np.ndarray, "h w"] | None,
+    scene: Scene,
+    K: Float[np.ndarray, "3 3"],
+) -> None:
+    """Apply each material's pattern, or its hue, saturation and value, to the pixels of its object, in place."""
     for i, placed in enumerate(scene.objects):
         material = placed.material
-        inside = layers.instance == i
+        inside = index == i
         if not inside.any():  # hidden by others, or out of sight
             continue
         if material.base_rgb is None and _changes_colour(material):
             rgb[inside] = _shift(rgb[inside], material)
         elif material.pattern is not None:
+            assert depth_m is not None
             v, u = np.nonzero(inside)
-            p_cam = back_project(K, np.stack([u, v], -1) + 0.5, layers.depth_m[v, u])
+            p_cam = back_project(K, np.stack([u, v], -1) + 0.5, depth_m[v, u])
             rgb[v, u] = pattern.paint(rgb[v, u], material, apply(inverse(placed.T_cam_obj), p_cam))
-    return rgb
 
 
 def _changes_colour(material: Material) -> bool:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from posecore.bop import ModelInfo
@@ -47,6 +47,7 @@ class Sources:
     models_info: Path | None = None
     allow_missing_textures: bool = False
     skip_bad_objects: bool = False
+    _loaded: dict[Path, Mesh] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def meshes(self) -> dict[int, Mesh]:
         """Objects by id; see `object_ids`. A skipped object does not change the ids of the others.
@@ -101,8 +102,11 @@ class Sources:
         )
 
     def _load(self, path: Path, units: Units) -> Mesh:
+        """The mesh of a file; the same object for a target and an occluder."""
         try:
-            return load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
+            if path not in self._loaded:
+                self._loaded[path] = load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
+            return self._loaded[path]
         except TextureError as error:
             raise MeshError(f"{error}, or add --allow-missing-textures for plain colours") from error
 

@@ -4,8 +4,10 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
+from posecore.detail import with_levels
 from posecore.errors import ConfigError, PoseError, RenderError
 from posecore.shard import Encoded
 from posecore.shard.layout import MANIFEST, TEST_SET
@@ -208,6 +210,9 @@ def _loaded(job: RenderJob) -> tuple[ShardJob, tuple[str, ...]]:
     """The job ready for one renderer, and the GPUs that it uses."""
     config, gpus = _with_device(job.config, job.scheduler)
     meshes, assets = job.sources.meshes(), job.sources.assets()
+    levelled = cache(with_levels)  # once for an object that is an occluder too
+    meshes = {obj_id: levelled(mesh) for obj_id, mesh in meshes.items()}
+    assets = replace(assets, occluders=tuple(map(levelled, assets.occluders)))
     card = data_card.rendered_card(config, job.n, meshes, assets)
     return ShardJob(config=config, card=card, meshes=meshes, assets=assets, threads=cores()), gpus
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from msgspec import Meta, Struct
 from posecore.camera import Camera, intrinsics
 from posecore.contour import contour_mask
+from posecore.detail import with_levels
 from posecore.errors import RenderError, ShardError
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
@@ -122,6 +123,8 @@ def load_facts(reader: ShardReader) -> Facts:
     K = intrinsics(camera["fx"], camera["fy"], camera["cx"], camera["cy"])
     whole = Camera(K=K, width_px=camera["width_px"], height_px=camera["height_px"])
     meshes = load_meshes(reader)
+    if "detail" in card:  # drawn again as the dataset was
+        meshes = {obj_id: with_levels(mesh) for obj_id, mesh in meshes.items()}
     return Facts(
         card=card, meshes=meshes, hulls_m={obj_id: hull(mesh) for obj_id, mesh in meshes.items()}, camera=whole
     )
