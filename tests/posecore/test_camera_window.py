@@ -113,3 +113,13 @@ def test_a_replicated_border_is_as_if_the_image_went_on(side_px: float) -> None:
         np.testing.assert_array_equal(window.cut_rgb(image, w, 32, border="replicate"), expected)
     outside = window.cut_rgb(image, window.Window(x0_px=-200.0, y0_px=0.0, side_px=24.0), 32)
     assert not outside.any()
+
+
+@pytest.mark.parametrize("focal", [1e308, 1e8, 1e-308, 0.0, -500.0, float("inf"), float("nan")])
+def test_a_camera_that_overflows_is_refused(focal):
+    with pytest.raises(CameraError, match="camera matrix: found"):
+        camera.Camera(K=camera.intrinsics(focal, 500.0, 320.0, 240.0), width_px=640, height_px=480)
+    with pytest.raises(CameraError, match="camera matrix: found"):
+        camera.Camera(K=camera.intrinsics(500.0, 500.0, 320.0, 1e300), width_px=640, height_px=480)
+    with pytest.raises(CameraError, match="image size: found 100000 x 480 px"):
+        camera.Camera(K=camera.intrinsics(500.0, 500.0, 320.0, 240.0), width_px=100_000, height_px=480)

@@ -218,3 +218,45 @@ def test_exit_codes() -> None:
     assert exit_code(MeshError("x")) == 1
     with pytest.raises(ConfigError, match="no such data specification"):
         files.data_spec("nothing.yaml")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("[" * 100_000, "brackets are nested too deep|more than"),
+        ("a: &a [1]\nb: &b [*a, *a, *a, *a, *a, *a, *a, *a]\n" + "\n".join(
+            f"{chr(c + 1)}: &{chr(c + 1)} [{', '.join([f'*{chr(c)}'] * 8)}]" for c in range(ord("b"), ord("m"))
+        ), "more than 100000 values, aliases counted each time"),
+        ("a: &a\n  b: *a\n", "more than 100000 values, aliases counted each time|invalid YAML"),
+        ("a: 2026-99-99", "invalid YAML"),
+        ("a: \x07", "invalid YAML"),
+        ("a: !!python/object:os.system {}", "invalid YAML"),
+        ("a: [1", "invalid YAML"),
+    ],
+    ids=["brackets", "bomb", "circle", "date", "control character", "python", "cut"],
+)  # fmt: skip
+def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path, text, line):
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=line) as caught:
+        config.load_yaml(file)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(file))
+    if "\n" not in text and len(text) < 100:
+        with pytest.raises(ConfigError, match="--set "):
+            config.apply_overrides({}, [f"x={text.removeprefix('a: ')}"])
+
+
+@pytest.mark.timeout(30)
+def test_a_yaml_that_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.yaml")
+    for file, reason in (
+        (tmp_path / "pipe.yaml", "is a pipe"),
+        ("/dev/zero", "is a device"),
+        (tmp_path, "is a folder"),
+    ):
+        with pytest.raises(ConfigError, match=f"cannot be read \\({reason}, expected a regular file\\)"):
+            config.load_yaml(file)
+    (tmp_path / "large.yaml").write_bytes(b"#" * (1 << 20) + b"\n")
+    with pytest.raises(ConfigError, match="has 1048577 bytes, expected at most 1048576"):
+        config.load_yaml(tmp_path / "large.yaml")

@@ -219,8 +219,8 @@ def test_a_name_in_a_csv_is_no_formula(name):
     cell = csv_cells.escaped(name)
     assert cell == "'" + name
     assert csv_cells.unescaped(cell) == name
-    (line,) = list(csv.reader(io.StringIO(csv_text(table_of(row(name), columns=(METHOD,))))))[1:]
-    assert line == [cell]
+    (line,) = list(csv.reader(io.StringIO(csv_text(table_of(row(name))))))[1:]
+    assert line[0] == cell
 
 
 @pytest.mark.parametrize("text", ["lmo", "a=b", "-0.5", "+1e3", "", "it's"])

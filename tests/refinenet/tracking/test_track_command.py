@@ -3,6 +3,7 @@
 import csv
 import itertools
 import json
+import os
 import shutil
 from contextlib import closing
 from dataclasses import replace
@@ -19,14 +20,14 @@ from posecore.bop import (
     read_sidecar,
 )
 from posecore.bop import write_results as write
-from posecore.errors import DatasetError
+from posecore.errors import CameraError, DatasetError
 from posecore.mesh import load_mesh, save_ply
 from posecore.symmetry import ContinuousSymmetry
 from refinenet.baselines.global_search import GradientSearch
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refine.registry import MethodSettings, make_refiner
 from refinenet.refiner import Refinement, Status
-from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile
+from refinenet.tracking.frame_sources import FileCamera, ImageFolder, VideoFile, read_camera
 from refinenet.tracking.state import GRADIENT_TRACKING, LEARNED_TRACKING, SEARCH_TRACKING, UNSCORED_TRACKING
 from refinenet.tracking.tracker import Tracker, default_config
 from refinenet.tracking.video import VideoWriter
@@ -218,6 +219,52 @@ def test_names_with_numbers_are_in_their_order(tmp_path):
     assert [(number, frame.image[0, 0, 0]) for number, frame in frames] == [(0, 1), (1, 2), (2, 10)]
 
 
+def test_ros_stamps_are_frame_numbers_and_longer_digits_are_not(tmp_path):
+    method = make_refiner(MethodSettings(method="edge-icp", iterations=1), {}, None)
+    for stems, numbers in (
+        (["1714129813249123450", "1714129813249123451"], [1714129813249123450, 1714129813249123451]),
+        (["17141298132491234500", "17141298132491234501"], [0, 1]),
+    ):
+        folder = tmp_path / stems[0]
+        folder.mkdir()
+        for stem in stems:
+            cv2.imwrite(str(folder / f"{stem}.png"), np.zeros((HEIGHT_PX, WIDTH_PX, 3), np.uint8))
+        frames = ImageFolder(folder=folder, camera=FileCamera(file=tmp_path / "cam.json", K=K)).frames(method)
+        assert [number for number, _ in frames] == numbers
+
+
+@pytest.mark.timeout(30)
+def test_a_video_that_is_a_pipe_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "pipe.avi")
+    with pytest.raises(DatasetError, match=r"pipe\.avi: cannot be read \(is a pipe, expected a regular file\)"):
+        VideoFile(file=tmp_path / "pipe.avi", camera=FileCamera(file=tmp_path / "cam.json", K=K))
+
+
+@pytest.mark.parametrize(
+    ("content", "line"),
+    [
+        ('{"fx": 1e308, "fy": 1, "cx": 0, "cy": 0}', "camera matrix: found"),
+        ('{"fx": 0, "fy": 1, "cx": 0, "cy": 0}', "camera matrix: found"),
+        ('{"fx": 1e999, "fy": 1, "cx": 0, "cy": 0}', "'fx' holds inf, expected 1 finite numbers"),
+        ('{"fx": 500, "fy": 500, "cx": 0}', "has no 'cy', expected 1 numbers"),
+        ('{"fx": 500, "fy": 500, "cx": 0, "cy": 0, "width": -1, "height": 2}', "'width' is -1, expected an integer"),
+        (
+            '{"fx": 500, "fy": 500, "cx": 0, "cy": 0, "width": 99999999, "height": 2}',
+            "image size: found 99999999 x 2 px",
+        ),
+        ("[" * 100_000, "brackets are nested too deep"),
+        ("null", "found a NoneType at the top"),
+    ],
+)
+def test_a_camera_file_out_of_bounds_is_one_line(tmp_path, content, line):
+    file = tmp_path / "camera.json"
+    file.write_text(content)
+    with pytest.raises(CameraError) as caught:
+        read_camera(file)
+    assert str(caught.value).startswith(str(file))
+    assert line in str(caught.value)
+
+
 @pytest.mark.slow
 def test_a_video_that_is_cut_off_is_not_taken_for_a_short_one(tmp_path):
     rng = np.random.default_rng(0)
@@ -257,7 +304,7 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         (["--dataset", root, *init, "--scene", 7], 1, "no scene 7"),
         (["--dataset", root, *init, "--object", 5], 2, "no pose of object 5 for scene 1"),
         ([images, *pose], 2, "need --camera"),
-        ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "found no numbers fx, fy, cx, cy"),
+        ([images, *pose, "--camera", tmp_path / "cam.json"], 1, "has no 'fy', expected 1 numbers"),
         ([images, *pose, *camera], 2, "object 1 has an initial pose and no mesh; give its file with --mesh"),
         ([tmp_path / "empty", *pose, *camera], 1, "no images"),
         ([root, *init], 2, f"track {root} is now track --dataset {root}"),

@@ -15,6 +15,7 @@ import pytest
 from click.testing import CliRunner
 from distributed import Client
 from distributed.security import Security
+from posecore.errors import ConfigError
 from render_processes import kill
 from render_processes import render_command as command
 from synthgen.cli import main
@@ -86,11 +87,11 @@ def test_a_render_listens_on_loopback_only_and_runs_no_strangers_code(tmp_path, 
         assert process.poll() is None
 
 
-def http(host, port):
-    """Answer to a request for the page that lists a scheduler's workers; none from a port of dask's protocol."""
+def http(host, port, page="/json/identity.json"):
+    """Answer to a request, for the page that lists a scheduler's workers; none from a port of dask's protocol."""
     try:
         with socket.create_connection((host, port), 30) as plain:
-            plain.sendall(b"GET /json/identity.json HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n")
+            plain.sendall(f"GET {page} HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n".encode())
             return plain.recv(4096)
     except ConnectionError:
         return b""
@@ -115,6 +116,22 @@ def test_the_dashboard_is_refused_by_name_without_its_library(tmp_path, tug_ply,
     result = CliRunner().invoke(main, command(tug_ply, tmp_path / "shards", small_set, "--dashboard")[3:])
     assert result.exit_code == 2
     assert "Error: --dashboard: needs the library bokeh; pip install 'synthgen[dashboard]'" in result.stderr
+
+
+@pytest.mark.slow
+def test_the_dashboard_is_on_loopback_at_its_port_and_a_taken_port_is_one_line(capfd):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        refused = pytest.raises(ConfigError, match=f"--dashboard {port}: this port is taken; give another one")
+        with refused, dask_cluster.connect(1, None, dashboard=port):
+            pass
+    assert capfd.readouterr().err == ""
+    with dask_cluster.connect(1, None, dashboard=port):
+        assert {host for _, host, _ in listening(os.getpid())} <= LOOPBACK
+        assert b" 200 " in http("127.0.0.1", port, "/status").partition(b"\r\n")[0]
+        assert b" 404 " in http("127.0.0.1", port, "/proxy/1/127.0.0.1/status").partition(b"\r\n")[0]
 
 
 def certificate(folder):

@@ -124,7 +124,7 @@ class ManifestLine(Struct):
 
     shard: Count
     n: Annotated[int, Meta(ge=1, le=1_000_000)]
-    rejected: Count
+    rejected: int  # the sum of a field that `synthgen verify` checks
     sha256: _Hash
     bytes: dict[Name, Count]
     quarantined: list[Count] = []

@@ -7,6 +7,7 @@ that is made for the run and passed in memory: a connection without it is refuse
 import importlib.util
 import logging
 import ssl
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -172,6 +173,7 @@ def _local(workers: int, dashboard: int | None) -> LocalCluster:
     security = Security.temporary()
     for tries_left in reversed(range(_START_TRIES)):
         try:
+            warnings.filterwarnings("ignore", "Port .* is already in use", UserWarning)  # `connect` refuses it
             return LocalCluster(
                 n_workers=workers,
                 threads_per_worker=1,
