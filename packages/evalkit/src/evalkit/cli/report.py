@@ -63,7 +63,7 @@ def report(
 
 
 def _change_lines(compared: dict[str, Any]) -> Iterator[str]:
-    """The change of a file in lines: all of it, what is better or worse, each score."""
+    """The change of a file in lines: headline, verdict, then a line for each score."""
     from evalkit.report.comparison import interval_words
 
     yield compared["headline"]
