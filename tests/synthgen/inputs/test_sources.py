@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner
 from posecore.errors import ConfigError, DatasetError, MeshError
 from synthgen.cli import main
@@ -168,3 +169,14 @@ def test_object_ids_follow_bop_names_or_the_order():
     assert object_ids(["obj_000009.ply", "b.ply"]) == [1, 2]
     with pytest.raises(ConfigError, match="object id 3"):
         object_ids(["a/obj_000003.ply", "b/obj_000003.ply"])
+
+
+def test_a_diameter_is_printed_with_its_unit(tmp_path, tug_ply):
+    box = trimesh.creation.box((0.3, 0.4, 1.2))
+    box.export(tmp_path / "box.glb")
+    for file, line in (
+        (tmp_path / "box.glb", "box.glb: diameter 1300.0 mm (glTF is in metres)"),
+        (tug_ply, "tug.ply: diameter 118.9 mm (--units mm)"),
+    ):
+        sources = Sources(objects=(file,), units="mm")
+        assert sources.diameter_lines(sources.meshes()) == [line]

@@ -10,7 +10,7 @@ from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
 from posecore.errors import ConfigError, DatasetError, MeshError, TextureError
 from posecore.mesh import Mesh, Units, load_mesh
-from posecore.mesh_files import SUFFIXES
+from posecore.mesh_files import METRE_SUFFIXES, SUFFIXES
 
 from synthgen.image.background import list_photos
 from synthgen.image.hdri import list_hdris
@@ -79,6 +79,8 @@ class Sources:
         unit_of = {
             str(file): "BOP models are in mm"
             if path.is_dir() and (path / MODELS_INFO).is_file()
+            else "glTF is in metres"
+            if file.suffix.lower() in METRE_SUFFIXES
             else f"--units {units}"
             for path in self.objects
             for file, units in find_meshes(path, self.units, "--object")
