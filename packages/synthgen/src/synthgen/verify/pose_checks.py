@@ -30,8 +30,9 @@ def poses(batch: SampleBatch) -> Float[np.ndarray, " n"]:
     for name in ("T_cam_obj", "T_cam_obj_hypothesis"):
         T = batch[name]
         R = T[:, :3, :3]
-        residual = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
-        residual = np.maximum(residual, np.abs(np.linalg.det(R) - 1.0))
+        with np.errstate(invalid="ignore", over="ignore"):  # NaN stays NaN, which fails
+            residual = np.abs(R @ np.swapaxes(R, 1, 2) - np.eye(3)).max(axis=(1, 2))
+            residual = np.maximum(residual, np.abs(np.linalg.det(R) - 1.0))
         worst = np.maximum(worst, np.maximum(residual, np.abs(T[:, 3] - np.array([0.0, 0.0, 0.0, 1.0])).max(axis=1)))
     return worst
 
