@@ -3,7 +3,7 @@ import re
 
 import pytest
 from click.testing import CliRunner
-from synthgen.cli import main
+from synthgen.cli import main, options
 from synthgen.cli.options import resumable
 
 
@@ -219,3 +219,12 @@ def test_an_interruption_names_only_a_folder_that_exists(tmp_path, capsys, exist
         raise KeyboardInterrupt
     assert ended.value.code == 130
     assert line in capsys.readouterr().err
+
+
+def test_a_mesh_that_takes_seconds_to_read_is_named_before(tug_ply, tmp_path, monkeypatch):
+    wrong = ("render", "--object", tug_ply, "--n", 4, "--out", tmp_path / "out", "--set", "distance.min=0.5")
+    assert "reading" not in invoke(*wrong).stderr
+    monkeypatch.setattr(options, "LARGE_MESH_BYTES", 1000)
+    lines = invoke(*wrong).stderr.splitlines()
+    assert re.fullmatch(rf"{re.escape(str(tug_ply))}: reading [0-9.]+ kB", lines[0])
+    assert "reading" not in invoke(*wrong, "--quiet").stderr

@@ -45,7 +45,7 @@ def test_a_dataset_of_many_faces_is_verified(dense: Path, config_of, tmp_path: P
     job = RenderJob(out=str(out), n=8, config=config_of("occluders.front=[1,2]"), sources=sources, workers=1)
     render_dataset(job)
     card = json.loads((out / "zarr.json").read_text())["attributes"]
-    assert card["detail"] == {"rms_error_px": 0.1, "max_error_px": 2.0}
+    assert card["detail"] == {"rms_error_px": 0.1, "max_error_px": 2.0, "spacing_px": 5.0}
     assert [finding.name for finding in verify(str(out)).findings if not finding.ok] == []
     reader = ShardReader(str(out))
     full = load_mesh(dense)

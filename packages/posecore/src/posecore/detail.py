@@ -48,6 +48,7 @@ def with_levels(mesh: Mesh) -> Mesh:
         surface = _Surface(points.astype(np.float64), faces)
         distances_mm = np.concatenate([surface.distances(original.samples), original.distances(surface.samples)])
         vertices, corners = positions.with_sources(points, faces)
+        edges = points[faces] - points[np.roll(faces, 1, axis=1)]
         levels.append(
             DetailLevel(
                 offsets=points[vertices[:, 0]] / diameter_mm,
@@ -55,6 +56,7 @@ def with_levels(mesh: Mesh) -> Mesh:
                 faces=corners.astype(np.int32),
                 rms_error=float(np.sqrt((distances_mm**2).mean())) / diameter_mm,
                 max_error=float(distances_mm.max()) / diameter_mm,
+                spacing=float(np.sqrt((edges**2).sum(axis=2).mean())) / diameter_mm,
                 is_closed=encloses_volume(points, faces),
             )
         )

@@ -35,6 +35,7 @@ class DetailLevel:
         faces: (f, 3) vertex indices.
         rms_error: Distance between the two surfaces, root mean square over both, in diameters.
         max_error: The largest distance, in diameters.
+        spacing: Length of an edge, root mean square, in diameters: colours are as fine as that.
         is_closed: See `Mesh.is_closed`.
     """
 
@@ -43,6 +44,7 @@ class DetailLevel:
     faces: Int[np.ndarray, "f 3"]
     rms_error: float
     max_error: float
+    spacing: float
     is_closed: bool
 
 

@@ -198,8 +198,17 @@ class Rasteriser:
         height_px: int,
         *,
         shading: Shading = HEADLIGHT,
+        samples: int = 1,
     ) -> tuple[UInt8[np.ndarray, "h w 3"], Int[np.ndarray, "h w"]]:
         """Colours and instances of `render_scene`, without depths, of which a large picture has many bytes.
+
+        Args:
+            instances: Objects.
+            K: Camera matrix.
+            width_px: Width.
+            height_px: Height.
+            shading: Lights.
+            samples: Pixels along a side that are averaged to one afterwards; levels of detail are chosen for that one.
 
         Raises:
             RenderError: More than 255 instances.
@@ -207,7 +216,7 @@ class Rasteriser:
         if len(instances) > MAX_PICTURE_INSTANCES:
             raise RenderError(f"a picture of {len(instances)} objects, expected at most {MAX_PICTURE_INSTANCES}")
         size = (width_px, height_px)
-        target = self._draw_scene(instances, K, size, "picture", shading)
+        target = self._draw_scene(instances, K, size, "picture", shading, samples)
         data = target.read(viewport=(0, 0, *size), components=4, attachment=0, alignment=1)
         layers = np.frombuffer(data, np.uint8).reshape(height_px, width_px, 4)
         return np.ascontiguousarray(layers[..., :3]), layers[..., 3].astype(np.int16) - 1
@@ -219,12 +228,13 @@ class Rasteriser:
         size: tuple[int, int],
         kind: Kind,
         shading: Shading,
+        samples: int = 1,
     ) -> moderngl.Framebuffer:
         self._set_shading(shading)
         target = self._begin(size, kind)
         depth_range_m = self._depth_range_m(instances)  # one for all that share a buffer
         for index, instance in enumerate(instances):
-            self._draw(instance, index + 1, np.asarray(K, np.float64), size, depth_range_m, kind)
+            self._draw(instance, index + 1, np.asarray(K, np.float64), size, depth_range_m, kind, samples)
         return target
 
     def _set_shading(self, shading: Shading) -> None:
@@ -260,13 +270,14 @@ class Rasteriser:
         size: tuple[int, int],
         depth_range_m: tuple[float, float],
         kind: Kind,
+        samples: int = 1,
     ) -> None:
         mesh = self._mesh(instance.obj_id)
         T = np.asarray(instance.T_cam_obj, np.float64)
         center_z_m, near_m = self._center_z_m(instance), depth_range_m[0]
         if center_z_m + mesh.diameter_m <= near_m or not is_in_image(mesh, K, T, *size):
             return
-        level = level_number(mesh, K, T)
+        level = level_number(mesh, np.diag([1 / samples, 1 / samples, 1.0]) @ K, T)
         arrays = self._array(instance.obj_id, mesh, level)
         # Half of a closed surface's faces are never seen; when the near plane opens it, its inside is.
         is_closed = mesh.levels[level - 1].is_closed if level else mesh.is_closed

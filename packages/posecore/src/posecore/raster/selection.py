@@ -9,6 +9,8 @@ RMS_ERROR_PX = 0.1
 """Distance in the image between the surface that is drawn and the mesh's own, root mean square."""
 MAX_ERROR_PX = 2.0
 """The largest such distance."""
+SPACING_PX = 5.0
+"""Largest length of an edge in the image, root mean square, where a level is drawn: colours lie at its ends."""
 _REACH_DIAMETERS = 0.8661
 """No vertex is farther from the box centre: half a diagonal, no side of the box being longer than the diameter."""
 
@@ -29,7 +31,8 @@ def is_in_image(
 def level_number(mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.ndarray, "4 4"]) -> int:
     """Level to draw: 0 is the mesh itself, k its `levels[k - 1]`. It depends on mesh, camera and pose alone.
 
-    The coarsest level whose errors stay within `RMS_ERROR_PX` and `MAX_ERROR_PX` at the depth of the box centre.
+    The coarsest level whose errors and edges stay within `RMS_ERROR_PX`, `MAX_ERROR_PX` and `SPACING_PX` at the depth
+    of the box centre.
     """
     if not mesh.levels:
         return 0
@@ -42,6 +45,8 @@ def level_number(mesh: Mesh, K: Float[np.ndarray, "3 3"], T_cam_obj: Float[np.nd
     fits = [
         number
         for number, level in enumerate(mesh.levels, 1)
-        if level.rms_error * px_per_diameter <= RMS_ERROR_PX and level.max_error * px_per_diameter <= MAX_ERROR_PX
+        if level.rms_error * px_per_diameter <= RMS_ERROR_PX
+        and level.max_error * px_per_diameter <= MAX_ERROR_PX
+        and level.spacing * px_per_diameter <= SPACING_PX
     ]
     return max(fits, default=0)

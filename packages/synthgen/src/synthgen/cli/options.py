@@ -3,6 +3,7 @@
 import functools
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +22,8 @@ required_out = click.option("--out", required=True, type=str, metavar="DIR", hel
 shards_out = click.option("--out", type=str, default="shards", metavar="DIR", help=_OUT_HELP)
 QUIET = click.option("--quiet", is_flag=True, help="No progress bar.")
 
+LARGE_MESH_BYTES = 20_000_000
+"""Of a mesh file whose reading is reported."""
 _SOURCES = (
     "objects",
     "units",
@@ -103,7 +106,8 @@ def scene_options(command: F) -> F:
     def with_sources(**values: Any) -> Any:
         from synthgen.inputs.sources import Sources
 
-        return command(sources=Sources(**{name: values.pop(name) for name in _SOURCES}), **values)
+        paths = {name: values.pop(name) for name in _SOURCES}
+        return command(sources=Sources(**paths, on_load=partial(_report_large, values["quiet"])), **values)
 
     wrapped: Any = with_sources
     for option in reversed(_SCENE_OPTIONS):
@@ -151,6 +155,14 @@ def echo_lines(lines: Sequence[str]) -> None:
     """Lines on stderr, above a progress bar."""
     for line in lines:
         click.echo(line, err=True)
+
+
+def _report_large(quiet: bool, mesh: Path) -> None:
+    """A line for a mesh file that takes seconds to read."""
+    from synthgen.machine import size_text
+
+    if not quiet and mesh.is_file() and mesh.stat().st_size >= LARGE_MESH_BYTES:
+        click.echo(f"{mesh}: reading {size_text(mesh.stat().st_size)}", err=True)
 
 
 def resumable(out: str) -> AbstractContextManager[None]:

@@ -74,7 +74,9 @@ class RasterEngine:
             layers = self._rasteriser.render_scene(instances, fine_K, *size, shading=shading)
             rgb, index, depth_m = layers.rgb, layers.instance, layers.depth_m
         else:  # only a pattern depends on the depth of each sample
-            rgb, index = self._rasteriser.render_picture(instances, fine_K, *size, shading=shading)
+            rgb, index = self._rasteriser.render_picture(
+                instances, fine_K, *size, shading=shading, samples=_SUPERSAMPLING
+            )
         assert rgb is not None
         _recolour(rgb, index, depth_m, scene, fine_K)
         exact = self._rasteriser.render_scene(instances, K, width, height, rgb=False)

@@ -1,7 +1,7 @@
 """Files named on the command line, loaded: meshes, symmetries, photographs, panoramas, occluders."""
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -37,6 +37,7 @@ class Sources:
         models_info: BOP file with symmetries; None reads the files in or beside `objects`.
         allow_missing_textures: Whether a mesh whose texture is missing gets its plain colours.
         skip_bad_objects: Whether objects that cannot be loaded are left out.
+        on_load: Called with each mesh file before it is read.
     """
 
     objects: tuple[Path, ...]
@@ -47,6 +48,7 @@ class Sources:
     models_info: Path | None = None
     allow_missing_textures: bool = False
     skip_bad_objects: bool = False
+    on_load: Callable[[Path], None] = field(default=lambda file: None, repr=False, compare=False)
     _loaded: dict[Path, Mesh] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def meshes(self) -> dict[int, Mesh]:
@@ -107,6 +109,7 @@ class Sources:
         """The mesh of a file; the same object for a target and an occluder."""
         try:
             if path not in self._loaded:
+                self.on_load(path)
                 self._loaded[path] = load_mesh(path, units=units, allow_missing_textures=self.allow_missing_textures)
             return self._loaded[path]
         except TextureError as error:

@@ -13,7 +13,7 @@ from posecore import config as config_tools
 from posecore.bop import BopDataset, ModelInfo, write_models
 from posecore.errors import ConfigError
 from posecore.mesh import Mesh
-from posecore.raster.selection import MAX_ERROR_PX, RMS_ERROR_PX
+from posecore.raster.selection import MAX_ERROR_PX, RMS_ERROR_PX, SPACING_PX
 from posecore.shard import GROUP, ShardWriter
 from posecore.shard.fields import schema
 from posecore.shard.layout import check_same_card, read_card
@@ -65,7 +65,7 @@ def _detail(meshes: Sequence[Mesh]) -> dict[str, Any]:
     """Errors that levels of detail may make in a render; nothing where every mesh is drawn in full."""
     if not any(mesh.levels for mesh in meshes):
         return {}
-    return {"detail": {"rms_error_px": RMS_ERROR_PX, "max_error_px": MAX_ERROR_PX}}
+    return {"detail": {"rms_error_px": RMS_ERROR_PX, "max_error_px": MAX_ERROR_PX, "spacing_px": SPACING_PX}}
 
 
 def cut_card(dataset: BopDataset, plan: Plan, config: CutConfig, *, drawn: bool = True) -> dict[str, Any]:
