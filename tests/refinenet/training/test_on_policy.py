@@ -138,7 +138,11 @@ def test_each_object_is_seen_through_its_own_window(centred, batch):
     with OnPolicyHypotheses(small(*OWN), {7: twice, 3: centred}) as own:
         after = own(Moves(), mixed, step=0)
     T, K = after.inputs.T_cam_obj, after.inputs.K_crop
-    across = K[:, 0, 0] * centred.diameter_m / (T[:, :3, :3] @ torch.from_numpy(centred.center_m).float() + T[:, :3, 3])[:, 2]
+    across = (
+        K[:, 0, 0]
+        * centred.diameter_m
+        / (T[:, :3, :3] @ torch.from_numpy(centred.center_m).float() + T[:, :3, 3])[:, 2]
+    )
     assert across[index == 0].numpy() == pytest.approx(64 / 1.5, rel=0.02)
     assert across[index == 1].numpy() == pytest.approx(32 / 1.5, rel=0.1)
 
