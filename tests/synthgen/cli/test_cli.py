@@ -155,9 +155,9 @@ def test_every_option_for_a_dataset_has_one_name():
     from refinenet.cli import main as refinenet
 
     reading = {
-        "evalkit": {name for name, command in evalkit.commands.items() if "--dataset" in options(command)},
-        "refinenet": {name for name, command in refinenet.commands.items() if "--dataset" in options(command)},
-        "synthgen": {name for name, command in main.commands.items() if "--dataset" in options(command)},
+        "evalkit": {name for name, command in evalkit.commands.items() if "--dataset" in options_of(command)},
+        "refinenet": {name for name, command in refinenet.commands.items() if "--dataset" in options_of(command)},
+        "synthgen": {name for name, command in main.commands.items() if "--dataset" in options_of(command)},
     }
     assert reading["evalkit"] == set(evalkit.commands)
     assert reading["refinenet"] == {"refine", "track"}
@@ -175,7 +175,7 @@ def test_every_option_for_a_dataset_has_one_name():
             assert names <= {"shards", "source", "a", "b", "renamed"}, command.name
 
 
-def options(command):
+def options_of(command):
     return {option for parameter in command.params for option in parameter.opts}
 
 

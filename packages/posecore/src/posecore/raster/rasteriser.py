@@ -18,6 +18,7 @@ from jaxtyping import Float, Int, UInt8
 from posecore import se3
 from posecore.errors import RenderError
 from posecore.mesh import Mesh
+from posecore.raster.clip import clip_from_cam
 from posecore.raster.context import thread_device
 from posecore.raster.scene import HEADLIGHT, MAX_LIGHTS, Instance, Layers, SceneLayers, Shading
 from posecore.raster.selection import is_in_image, level_number
@@ -287,7 +288,7 @@ class Rasteriser:
             self._context.disable(moderngl.CULL_FACE)
         array = arrays[kind]
         program = array.program
-        program["clip_from_cam"].write(_clip_from_cam(K, *size, *depth_range_m).T.astype("f4").tobytes())
+        program["clip_from_cam"].write(clip_from_cam(K, *size, *depth_range_m).T.astype("f4").tobytes())
         program["cam_from_obj"].write(se3.with_origin_at(T, mesh.center_m).T.astype("f4").tobytes())
         if kind != "depth":
             program["instance"].value = float(label)
@@ -380,23 +381,6 @@ class Rasteriser:
             if attachment is not None:
                 attachment.release()
         target.release()
-
-
-def _clip_from_cam(
-    K: Float[np.ndarray, "3 3"], width_px: int, height_px: int, near_m: float, far_m: float
-) -> Float[np.ndarray, "4 4"]:
-    """Projection to GL clip space with image row 0 at the framebuffer's first row, so nothing is flipped on reading."""
-    w, h = float(width_px), float(height_px)
-    depth_scale = (far_m + near_m) / (far_m - near_m)
-    depth_shift = -2.0 * far_m * near_m / (far_m - near_m)
-    return np.array(
-        [
-            [2 * K[0, 0] / w, 0.0, 2 * K[0, 2] / w - 1.0, 0.0],
-            [0.0, 2 * K[1, 1] / h, 2 * K[1, 2] / h - 1.0, 0.0],
-            [0.0, 0.0, depth_scale, depth_shift],
-            [0.0, 0.0, 1.0, 0.0],
-        ]
-    )
 
 
 def _images_at_once(size: tuple[int, int]) -> int:

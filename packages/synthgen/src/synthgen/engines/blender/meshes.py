@@ -25,8 +25,7 @@ def make_mesh(key: int, mesh: Mesh) -> bpy.types.Mesh:
     Raises:
         MeshError: No faces, or a face names a vertex that is not there.
     """
-    vertices, faces = np.asarray(mesh.vertices_m, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
-    _check(mesh, vertices, faces)
+    check_mesh(mesh)
     mesh = mesh.drawn
     vertices, faces = np.asarray(mesh.vertices_m, np.float32), np.ascontiguousarray(mesh.faces, np.int32)
     block = bpy.data.meshes.new(f"mesh_{key}")
@@ -71,8 +70,13 @@ def make_texture(key: int, mesh: Mesh) -> bpy.types.Image | None:
     return image
 
 
-def _check(mesh: Mesh, vertices: Float[np.ndarray, "v 3"], faces: np.ndarray) -> None:
-    name = mesh.path or "mesh"
+def check_mesh(mesh: Mesh) -> None:
+    """Refuse a mesh without faces, or whose faces name a vertex that is not there, or is not finite.
+
+    Raises:
+        MeshError: There is such a fault.
+    """
+    name, vertices, faces = mesh.path or "mesh", mesh.vertices_m, mesh.faces
     if len(faces) == 0 or len(vertices) == 0:
         raise MeshError(f"{name}: got {len(vertices)} vertices and {len(faces)} faces, expected at least one triangle")
     if faces.min() < 0 or faces.max() >= len(vertices):

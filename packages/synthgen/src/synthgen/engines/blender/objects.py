@@ -13,7 +13,7 @@ from posecore.mesh import Mesh
 
 from synthgen.engines.blender.camera import blender_from_opencv
 from synthgen.engines.blender.materials import make_surface, set_material
-from synthgen.engines.blender.meshes import make_mesh, make_texture
+from synthgen.engines.blender.meshes import check_mesh, make_mesh, make_texture
 from synthgen.engines.blender.visibility import show
 from synthgen.scene import SceneObject, with_origins_at
 
@@ -42,6 +42,7 @@ class Props:
         patterns are about the origin.
         """
         for key, loaded in meshes.items():
+            check_mesh(loaded)
             self._centers_m[key] = loaded.center_m
             mesh = loaded.with_origin_at(loaded.center_m)
             block = make_mesh(key, mesh)
