@@ -41,7 +41,7 @@ def commands(shards, out):
         "info": (synthgen, ["info", str(shards)]),
         "verify": (synthgen, ["verify", str(shards), "--quiet", "--workers", "1"]),
         "preview": (synthgen, ["preview", str(shards), "--out", str(out / "sheet.png")]),
-        "export": (synthgen, ["export", str(shards), str(out / "a.h5"), "--quiet"]),
+        "export": (synthgen, ["export", str(shards), "--out", str(out / "a.h5"), "--quiet"]),
         "merge": (synthgen, ["merge", str(shards), str(other), "--out", str(out / "merged"), "--quiet"]),
         "train": (refinenet, ["train", str(shards), "--out", str(out / "run"), "--steps", "1", "--quiet"]),
     }

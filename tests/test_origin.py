@@ -244,7 +244,18 @@ def test_tracks_are_the_same(copies, networks, name, tmp_path):
         arguments += ["--depth-step", 0.03]
     for root in copies.roots:
         out = tmp_path / f"{root.name}.csv"
-        command = ("track", root, "--init", root / "start.csv", "--out", out, "--motion-model", "--threads", 1)
+        command = (
+            "track",
+            "--dataset",
+            root,
+            "--init",
+            root / "start.csv",
+            "--out",
+            out,
+            "--motion-model",
+            "--threads",
+            1,
+        )
         run(refinenet, *command, "--quiet", *arguments)
         tracks.append(out)
     assert_same_poses(*map(read_results, tracks))
@@ -320,7 +331,19 @@ def test_cut_pairs_are_the_same(copies, tmp_path):
     readers = []
     for root in copies.roots:
         out = tmp_path / root.name
-        run(synthgen, "cut", root, "--out", out, "--quiet", "--set", "patch_px=64", "--set", "min_area_px=20")
+        run(
+            synthgen,
+            "cut",
+            "--dataset",
+            root,
+            "--out",
+            out,
+            "--quiet",
+            "--set",
+            "patch_px=64",
+            "--set",
+            "min_area_px=20",
+        )
         readers.append(ShardReader(str(out)))
     assert_same_pairs(*readers)
 

@@ -538,8 +538,8 @@ def test_few_are_shown_and_all_are_counted(sound, tmp_path):
         file, [e for e in perfect(sound, T_cam_obj=se3.make_T(se3.random_rotation(rng), np.array([0, 0, 0.5])))]
     )
     file.write_text(file.read_text() + "1,2\n" * 25)
-    few = CliRunner().invoke(command, [str(sound), str(file), "--samples", "0"])
-    every = CliRunner().invoke(command, [str(sound), str(file), "--samples", "0", "--all"])
+    few = CliRunner().invoke(command, ["--dataset", str(sound), "--results", str(file), "--samples", "0"])
+    every = CliRunner().invoke(command, ["--dataset", str(sound), "--results", str(file), "--samples", "0", "--all"])
     assert few.output.count("found 2 fields") == 10
     assert "error line-line: 15 more like this; see --all" in few.output
     assert every.output.count("found 2 fields") == 25
@@ -549,14 +549,14 @@ def test_few_are_shown_and_all_are_counted(sound, tmp_path):
 
 def test_the_command_ends_with_1_on_errors_only(root, tmp_path):
     out = tmp_path / "check.json"
-    good = CliRunner().invoke(command, [str(root), "--json", str(out)])
+    good = CliRunner().invoke(command, ["--dataset", str(root), "--json", str(out)])
     assert good.exit_code == 0, good.output
     assert good.output.startswith("nothing wrong; checked: models 2")
     assert json.loads(out.read_text())["ok"] is True
     DATASET_FAULTS["blank"][0](root)
-    assert CliRunner().invoke(command, [str(root)]).exit_code == 0
+    assert CliRunner().invoke(command, ["--dataset", str(root)]).exit_code == 0
     DATASET_FAULTS["K"][0](root)
-    bad = CliRunner().invoke(command, [str(root), "--json", str(out)])
+    bad = CliRunner().invoke(command, ["--dataset", str(root), "--json", str(out)])
     assert bad.exit_code == 1
     content = json.loads(out.read_text())
     assert content["counts"] == {"error": 1, "warning": 1, "hint": 0}

@@ -117,7 +117,7 @@ def test_a_preview_is_spread_over_scenes(tug, config_of, tmp_path, monkeypatch):
 
     write_dataset(tmp_path / "shards", config_of("hypotheses_per_scene=4", "shard_size=8"), {1: tug}, 24)
     shown = []
-    monkeypatch.setattr(preview, "sample_row", lambda sample, index: shown.append(index) or preview.title_row())
+    monkeypatch.setattr(preview, "sample_row", lambda sample, index, meshes: shown.append(index) or preview.title_row())
 
     def indices(count, first=None):
         shown.clear()
