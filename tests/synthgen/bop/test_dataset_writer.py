@@ -196,19 +196,19 @@ def test_workers_that_are_interrupted_leave_no_temporary_files(tmp_path, config_
 @pytest.mark.slow
 def test_kill_9_of_the_whole_run_loses_only_frames_in_flight(crowded, tmp_path, tug_ply, bobbin_ply, config_of, meshes):
     script = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import sys; sys.path[:0] = sys.argv[1:3]\n"
         "from posecore.mesh import load_mesh\n"
         "from synthgen.bop.dataset_writer import write_dataset\n"
         "from synthgen.config import load_config\n"
         "from synthgen.bop.frame_maker import FramePlan\n"
         "from conftest import SMALL\n"
         "from bop.test_dataset_writer import MANY\n"
-        "meshes = {1: load_mesh(sys.argv[3]), 4: load_mesh(sys.argv[4])}\n"
-        "write_dataset(sys.argv[2], load_config('default', [*SMALL, *MANY]), meshes, FramePlan(frames=5))\n"
+        "meshes = {1: load_mesh(sys.argv[4]), 4: load_mesh(sys.argv[5])}\n"
+        "write_dataset(sys.argv[3], load_config('default', [*SMALL, *MANY]), meshes, FramePlan(frames=5))\n"
     )
-    here, out = str(Path(__file__).parents[1]), tmp_path / "k"
+    here, out = Path(__file__).parents[1], tmp_path / "k"
     journal = out / "test/000001/.frames.jsonl"
-    with started([sys.executable, "-c", script, here, out, tug_ply, bobbin_ply]) as process:
+    with started([sys.executable, "-c", script, here, here.parent, out, tug_ply, bobbin_ply]) as process:
         wait_until(lambda: journal.is_file() and journal.stat().st_size, process)
     assert process.returncode == -signal.SIGKILL, "the run ended before it could be killed"
     (out / "test/000001/rgb/.000003.png.1.tmp").write_bytes(b"half")  # what a kill within a write leaves

@@ -138,7 +138,9 @@ def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, sm
         result = run(tug_ply, reference, small_set, *extra)
         assert result.returncode == 1
         assert named in result.stderr
-        assert result.stderr.count("\n") == 1
+        diameter, error = result.stderr.splitlines()
+        assert error.startswith("Error: ")
+        assert diameter == "tug.ply: diameter 118.9 mm (--units mm)"
     assert tree(reference) == before
 
 

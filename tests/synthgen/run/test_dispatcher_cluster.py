@@ -11,6 +11,7 @@ import psutil
 import pytest
 from children import run, started, wait_until
 from click.testing import CliRunner
+from distributed import Client
 from render_processes import kill
 from render_processes import render_command as command
 from synthgen.cli import main
@@ -78,7 +79,7 @@ def renderers(process):
 
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_bytes(cluster, tmp_path, tug_ply, small_set):
-    undisturbed = run(command(tug_ply, tmp_path / "local", small_set, "--workers", "1"))
+    undisturbed = run(command(tug_ply, tmp_path / "local", small_set, "--workers", "1", "--test-images", "0"))
     assert undisturbed.returncode == 0, undisturbed.stderr
     first, second = cluster.worker(), cluster.worker()
     out = tmp_path / "shards"
@@ -124,6 +125,8 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
         (old.parent, ("has synthgen 0.0.1, the command ",)),
     ):
         process = cluster.worker(PYTHONPATH=str(folder))
+        with Client(cluster.address) as client:  # a job that is there first waits for other workers
+            client.wait_for_workers(1)
         result = run(arguments)
         for word in words:
             assert word in error_line(result)

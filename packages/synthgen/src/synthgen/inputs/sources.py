@@ -24,6 +24,10 @@ LARGEST_OBJECT_ID = 2**31 - 1
 MOST_DIAMETER_LINES = 30
 
 
+def _nothing(file: Path) -> None:
+    """The default of `Sources.on_load`, which processes can be sent."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sources:
     """Paths of a dataset's inputs.
@@ -48,7 +52,7 @@ class Sources:
     models_info: Path | None = None
     allow_missing_textures: bool = False
     skip_bad_objects: bool = False
-    on_load: Callable[[Path], None] = field(default=lambda file: None, repr=False, compare=False)
+    on_load: Callable[[Path], None] = field(default=_nothing, repr=False, compare=False)
     _loaded: dict[Path, Mesh] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def meshes(self) -> dict[int, Mesh]:

@@ -42,6 +42,7 @@ _DEATHS_IN_A_ROW = 10  # plus four per worker, without a result in between, befo
 _REGISTER_TRIES = 10
 _POLL_S = 5.0  # between counts of the workers
 _LOST_S = 600.0  # without any local worker before the run stops
+_WAITING_S = 120.0  # without any worker of a cluster before a warning
 
 
 @dataclass(kw_only=True, eq=False)
@@ -311,7 +312,7 @@ class Dispatcher:
             self._dead = cluster.revive(self._client.cluster, self._dead)
         if threads:
             self._connected_s = now
-        elif now - self._connected_s > _LOST_S:
+        elif now - self._connected_s > (_LOST_S if self._local else _WAITING_S):
             if self._local:
                 raise RenderError("all worker processes are gone and do not start again; start the same command again")
             log.warning("no worker is connected to the scheduler; waiting for one")
