@@ -265,7 +265,7 @@ DATASET_FAULTS = {
         set_camera(depth_scale=100.0),
         "error",
         "depth-scale",
-        r"depth is \d{3,4}.* times the objects.*is the scale 0\.1",
+        r"depth is \d{3,4}.* times that of the objects.*is the scale 0\.1",
     ),
     "world": (
         set_camera(cam_R_w2c=[1, 0, 0, 0, 1, 0, 0, 0, 9], cam_t_w2c=[0, 0, 0]),
