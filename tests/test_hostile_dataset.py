@@ -17,7 +17,6 @@ from refinenet.cli import main as refinenet
 from synthgen.cli import main as synthgen
 from synthgen.inspect.info import dataset_info, info_text
 
-pytestmark = pytest.mark.timeout(300)
 ABSENT = object()
 SOUND = Path(__file__).parent / "data/dataset_before_vocabulary/pairs"
 
@@ -187,7 +186,7 @@ SAMPLES = [
 ]
 
 
-@pytest.mark.parametrize("name", ["preview", "export", "merge", "train"])
+@pytest.mark.parametrize("name", ["preview", "export", "merge", pytest.param("train", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("field", "change", "words"), SAMPLES, ids=[words[:40] for _, _, words in SAMPLES])
 def test_a_sample_that_cannot_be_used_is_named(shards, tmp_path, name, field, change, words):
     if name == "train" and field in ("K_crop", "window_px", "visible_fraction"):
@@ -239,6 +238,7 @@ def copy(sound, tmp_path_factory):
     return shutil.copytree(sound, tmp_path_factory.mktemp("damaged") / "shards")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["zarr.json", "manifest.jsonl"])
 @settings(fuzz, max_examples=200)
 @given(which=st.integers(0, 10_000), new=strange, rename=st.booleans())

@@ -39,6 +39,7 @@ SHIFT_M = np.array([2.0, -1.0, 0.5])
 """Position of the plain mesh's origin in the shifted mesh's frame."""
 GRID_MM = 2.0**-12
 TUG, BOBBIN = 1, 5
+pytestmark = pytest.mark.slow
 CAMERA = Camera(K=intrinsics(500.0, 503.0, 161.5, 118.0), width_px=320, height_px=240)
 FRAMES = 5
 CHECKPOINTS = Path(__file__).resolve().parents[1] / "examples/checkpoints"
@@ -192,7 +193,6 @@ METHODS = {
     "compact, version 1": ["--checkpoint", "compact, version 1"],
     "flow, version 1": ["--checkpoint", "flow, version 1"],
 }
-SLOW = ("search", "search and flow", "region")
 
 
 def with_network(arguments, networks):
@@ -202,9 +202,7 @@ def with_network(arguments, networks):
     return [networks.get(argument, argument) for argument in arguments] + ["--allow-other-mesh", "--object", TUG]
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in METHODS]
-)
+@pytest.mark.parametrize("name", METHODS)
 def test_refined_poses_are_the_same(copies, networks, name, tmp_path):
     arguments, results = with_network(METHODS[name], networks), []
     if name == "compact, pool ranked by learned confidence":
@@ -370,7 +368,6 @@ def test_rendered_frames_are_the_same(copies, tmp_path):
 PRECOMPUTED = ("window.kind=fixed", "hypothesis.online=false", "loss.name=contour")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "settings"),
     [("compact", ("on_policy.fraction=0.5", "on_policy.begin=0")), ("compact", PRECOMPUTED), ("flow", ())],
@@ -396,7 +393,7 @@ def test_training_is_the_same(pairs, preset, settings, tmp_path):
 PATTERN = Pattern(accent_rgb=(0.9, 0.2, 0.1), wave=(150.0, 80.0, -60.0), warp=(40.0, -90.0, 30.0))
 
 
-@pytest.mark.parametrize("name", ["raster", pytest.param("cycles", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["raster", "cycles"])
 def test_an_engine_draws_a_copy_alike_bit_for_bit(name, meshes):
     """Patterns and lamps are about the centre; coordinates are exact in binary here."""
     exact = replace(meshes[TUG], vertices_m=np.round(meshes[TUG].vertices_m * 2**20) / 2**20)
