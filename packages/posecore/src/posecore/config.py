@@ -174,6 +174,11 @@ def apply_overrides(mapping: Mapping[str, Any], overrides: Sequence[str]) -> dic
     return result
 
 
+def sources(where: str, overrides: Sequence[str]) -> str:
+    """Where a configuration comes from, for messages: a preset or file, then the assignments laid over it."""
+    return "".join([where, *(f", --set {assignment}" for assignment in overrides)])
+
+
 def assigned_keys(overrides: Sequence[str]) -> list[str]:
     """The keys, with dots between groups, that assignments give a value to; those of a group each."""
     return _leaves(apply_overrides({}, overrides), "")

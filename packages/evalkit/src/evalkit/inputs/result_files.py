@@ -84,6 +84,8 @@ def dataset_of(paths: Sequence[Path], folder: Path) -> Path:
     """
     named: dict[Path, Path] = {}
     for path in paths:
+        if not path.exists():
+            raise ConfigError(f"{path}: no such file; give a BOP result file")
         value = (read_sidecar(path) or {}).get("dataset")
         if not isinstance(value, str) or not value:
             continue

@@ -33,7 +33,7 @@ def load_config(preset: str, overrides: Sequence[str] = (), file: Path | None = 
     full = [f"network.{item}" if item.startswith(("backbone.", "backbone=")) else item for item in overrides]
     refuse_renamed_keys(posecore_config.apply_overrides({}, full), RENAMED, "--set")
     mapping = posecore_config.apply_overrides(mapping, full)
-    config = posecore_config.build(TrainConfig, mapping, where, renamed=RENAMED)
+    config = posecore_config.build(TrainConfig, mapping, posecore_config.sources(where, overrides), renamed=RENAMED)
     require_used(config, posecore_config.assigned_keys(full))
     return config
 

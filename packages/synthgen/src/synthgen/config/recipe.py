@@ -126,4 +126,4 @@ def load_config(
     refuse_renamed_keys(config_tools.apply_overrides({}, overrides), RENAMED_KEYS, "--set")
     mapping = config_tools.apply_overrides(mapping, overrides)
     mapping.update({k: v for k, v in (values or {}).items() if v is not None})
-    return config_tools.build(SynthConfig, mapping, where, RENAMED_KEYS)
+    return config_tools.build(SynthConfig, mapping, config_tools.sources(where, overrides), RENAMED_KEYS)
