@@ -31,6 +31,14 @@ def apply(T: Float[np.ndarray, "*b 4 4"], points: Float[np.ndarray, "*c n 3"]) -
     return np.asarray(points @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3])
 
 
+def rotated(R: Float[np.ndarray, "*b 3 3"], vectors: Float[np.ndarray, "*c 3"]) -> Float[np.ndarray, "*d 3"]:
+    """`R v` of each rotation and vector; batch axes of both broadcast.
+
+    BLAS, behind `R @ v`, rounds by the matrix's address in memory, and so by its place in the batch; this does not.
+    """
+    return np.asarray((R * vectors[..., None, :]).sum(axis=-1))
+
+
 def with_origin_at(
     T_cam_obj: Float[np.ndarray, "*b 4 4"], point_m: Float[np.ndarray, "*c 3"]
 ) -> Float[np.ndarray, "*b 4 4"]:
@@ -43,7 +51,7 @@ def with_origin_at(
         point_m: In the object's frame, metres: one point, or a point of each pose.
     """
     R = T_cam_obj[..., :3, :3]
-    return make_T(R, (R * np.asarray(point_m, np.float64)[..., None, :]).sum(axis=-1) + T_cam_obj[..., :3, 3])
+    return make_T(R, rotated(R, np.asarray(point_m, np.float64)) + T_cam_obj[..., :3, 3])
 
 
 def rotation_angle_rad(R: Float[np.ndarray, "*b 3 3"]) -> Float[np.ndarray, "*b"]:

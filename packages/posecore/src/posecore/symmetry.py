@@ -55,7 +55,7 @@ def rotations_about_axis(
     rotations = np.eye(3) + sin * cross + (1.0 - cos) * (cross @ cross)
     transforms = np.tile(np.eye(4), (len(angles_rad), 1, 1))
     transforms[:, :3, :3] = rotations
-    transforms[:, :3, 3] = offset_m - rotations @ offset_m
+    transforms[:, :3, 3] = offset_m - se3.rotated(rotations, offset_m)
     return transforms
 
 
@@ -184,7 +184,7 @@ def symmetric_copies(
     if is_ball(axes):
         center_m = ball_center_m(axes)
         R = _ball_rotation(T_cam_obj, T_reference, center_m, None if by == "rotation" else _required(points_m))
-        return np.asarray(T_cam_obj @ se3.make_T(R, center_m - R @ center_m))[..., None, :, :]
+        return np.asarray(T_cam_obj @ se3.make_T(R, center_m - se3.rotated(R, center_m)))[..., None, :, :]
     axis, offset_m = np.asarray(axes[0].axis, np.float64), np.asarray(axes[0].offset_m, np.float64)
     axis = axis / np.linalg.norm(axis)
     if by == "rotation":
@@ -214,9 +214,9 @@ def _rotation_nearest(
     """
     skew = np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
     along = np.einsum("i,...ij,j->...", axis, M, axis)
-    angle_rad = np.arctan2(skew @ axis, np.trace(M, axis1=-2, axis2=-1) - along)
+    angle_rad = np.arctan2((skew * axis).sum(axis=-1), np.trace(M, axis1=-2, axis2=-1) - along)
     R = se3.rotation_from_rotvec(np.nan_to_num(angle_rad)[..., None] * axis)
-    return se3.make_T(R, offset_m - R @ offset_m)
+    return se3.make_T(R, offset_m - se3.rotated(R, offset_m))
 
 
 def _ball_rotation(

@@ -9,6 +9,7 @@ Sources: Hodan et al., "On Evaluation of 6D Object Pose Estimation", ECCVW 2016,
 
 import numpy as np
 from jaxtyping import Bool, Float
+from posecore import se3
 
 from evalkit.pose_errors import kernels
 from evalkit.pose_errors.nearest_points import NearestPoints
@@ -129,7 +130,8 @@ def te_axes(T_est: Poses, T_gt: Poses) -> Float[np.ndarray, "*b 3"]:
 
 def viewpoint_deg(T_cam_obj: Poses) -> tuple[Errors, Errors]:
     """Direction of the camera seen from the poses' origins, degrees: azimuth about z from x, elevation over xy."""
-    x, y, z = np.moveaxis(-(_inverse(T_cam_obj[..., :3, :3]) @ T_cam_obj[..., :3, 3:])[..., 0], -1, 0)
+    camera = -se3.rotated(_inverse(T_cam_obj[..., :3, :3]), T_cam_obj[..., :3, 3])
+    x, y, z = np.ascontiguousarray(np.moveaxis(camera, -1, 0))  # the arc tangent of strided arrays rounds by place
     return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
 
 

@@ -95,7 +95,7 @@ def offset_poses(
     centre_m = mesh.center_cam_m(initial)
     across_m = np.pad(mesh.diameter_m * offsets[:, 3:5], ((0, 0), (0, 1)))
     R = se3.rotation_from_rotvec(offsets[:, :3]) @ initial[:3, :3]
-    t = np.exp(offsets[:, 5:]) * (centre_m + across_m) - R @ mesh.center_m
+    t = np.exp(offsets[:, 5:]) * (centre_m + across_m) - se3.rotated(R, mesh.center_m)
     return se3.make_T(R, t)
 
 

@@ -74,7 +74,7 @@ def make_viewpoint_model(obj_id: int, mesh: Mesh, rasteriser: Rasteriser) -> Vie
     """Viewpoint model of an object that the rasteriser holds."""
     z = se3.even_directions(VIEWPOINTS)
     R = se3.rotations_along(z)
-    T = se3.make_T(R, np.array([0.0, 0.0, DISTANCE_DIAMETERS * mesh.diameter_m]) - R @ mesh.center_m)
+    T = se3.make_T(R, np.array([0.0, 0.0, DISTANCE_DIAMETERS * mesh.diameter_m]) - se3.rotated(R, mesh.center_m))
     f_px = VIEW_PX * DISTANCE_DIAMETERS / WINDOW_SCALE
     K = np.array([[f_px, 0.0, VIEW_PX / 2], [0.0, f_px, VIEW_PX / 2], [0.0, 0.0, 1.0]])
     rng = np.random.default_rng(0)
