@@ -69,7 +69,12 @@ SHOWN_FAILURES = 5
     help="Also write all poses that --method search scored: hypotheses for synthgen cut.",
 )  # fmt: skip
 @device_option
-@click.option("--batch", type=click.IntRange(1), default=64, help="Largest number of poses in a forward pass.")
+@click.option(
+    "--batch",
+    type=click.IntRange(1),
+    default=64,
+    help="Largest number of poses rendered together; on a GPU, in a forward pass.",
+)
 @threads_option
 @workers_option
 @other_mesh_option

@@ -56,7 +56,9 @@ class Refiner:
         meshes: Objects by id, those of the training data.
         iterations: Largest number of updates of a pose; an update under 1.5 deg and 7.5 mm is the last.
         device: `auto`, `cpu` or `cuda`.
-        batch: Largest number of poses in a forward pass; halved, with a warning, where the GPU's memory is too small.
+        batch: Largest number of poses rendered together, on a GPU also in a forward pass, where it is halved, with a
+            warning, if the memory is too small. A forward pass on a CPU is of one pose: sums of a network are rounded
+            by the size of its batch, and a pose's result must not depend on the others.
         allow_other_mesh: Accept a mesh of the trained object's size that is not the trained one.
         min_confidence: Least confidence of a refined pose; a less confident one fails.
 
@@ -99,8 +101,11 @@ class Refiner:
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
+        if self.device.type == "cpu":
+            self._network.to(memory_format=torch.channels_last)  # faster, the same bits
         self._uses_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
+        self._pass = 1 if self.device.type == "cpu" else batch  # poses in a forward pass
         self.patch_renderer = PatchRenderer(self.frames.meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
 
@@ -280,19 +285,19 @@ class Refiner:
 
     def predict(self, patches: Patches, T: Float[np.ndarray, "s 4 4"]) -> PoseUpdate:
         """The network's update for these patches and poses of the pivots, in as many passes as the memory requires."""
-        requested = self._batch
+        requested = self._pass
         while True:
             try:
-                parts = [self._forward(patches, T, first) for first in range(0, len(T), self._batch)]
+                parts = [self._forward(patches, T, first) for first in range(0, len(T), self._pass)]
                 break
             except torch.OutOfMemoryError as error:
-                if min(self._batch, len(T)) == 1:
+                if min(self._pass, len(T)) == 1:
                     raise RefinementError(
                         "the GPU's memory is too small for a single pose; free it, or run with --device cpu"
                     ) from error
-                self._batch = min(self._batch, len(T)) // 2
-        if self._batch != requested:
-            fits = self._batch
+                self._pass = min(self._pass, len(T)) // 2
+        if self._pass != requested:
+            fits = self._pass
             log.warning(
                 "a batch of %d poses does not fit into the GPU's memory, %d do; use --batch %d", requested, fits, fits
             )
@@ -304,7 +309,7 @@ class Refiner:
         )
 
     def _forward(self, patches: Patches, T: Float[np.ndarray, "s 4 4"], first: int) -> PoseUpdate:
-        part = slice(first, first + self._batch)
+        part = slice(first, first + self._pass)
         inputs = NetworkInput(
             scene_rgb=self._tensor(patches.scene_rgb[part].transpose(0, 3, 1, 2)),
             hypothesis_rgb=self._tensor(patches.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
