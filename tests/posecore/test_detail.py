@@ -197,3 +197,38 @@ def test_a_picture_has_the_colours_and_instances_of_the_scene(ball: Mesh) -> Non
     for layer in (instance, labels.instance):
         np.testing.assert_array_equal(layer, scene.instance)
     np.testing.assert_array_equal(labels.depth_m, scene.depth_m)
+
+
+def uv_ball(rows: int, columns: int) -> Mesh:
+    """A ball as exporters write it: each pole is as many vertices at one position as there are meridians."""
+    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, columns + 1), indexing="ij")
+    unit = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], axis=-1)
+    unit = unit.round(12).reshape(-1, 3)
+    a = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).reshape(-1)
+    b, c, d = a + 1, a + columns + 1, a + columns + 2
+    faces = np.concatenate([np.stack([a, c, b], axis=-1), np.stack([b, c, d], axis=-1)])
+    return Mesh(vertices_m=0.05 * unit, faces=faces.astype(np.int32), normals=unit)
+
+
+def test_many_vertices_at_one_position_cost_no_more_each(monkeypatch):
+    calls, einsum = [], np.einsum
+    monkeypatch.setattr(detail.np, "einsum", lambda *args, **options: calls.append(1) or einsum(*args, **options))
+    mesh = with_levels(uv_ball(20, 400))
+    assert len(mesh.levels) >= 4
+    assert len(calls) <= 2 * len(mesh.levels)
+    for level in mesh.levels:
+        assert (einsum("vi,vi->v", mesh.normals[level.sources], level.offsets) > 0.4).all()
+
+
+def test_of_vertices_at_one_position_the_first_that_fits_best_is_taken():
+    mesh = uv_ball(6, 30)
+    rng = np.random.default_rng(0)
+    mesh = replace(mesh, normals=rng.integers(-2, 3, mesh.normals.shape).astype(np.float64))  # of which many are equal
+    positions = detail._Positions(mesh)
+    point = rng.integers(0, len(positions.points_mm), 500)
+    normal = rng.normal(size=(500, 3))
+    chosen = positions._fitting(point, normal)
+    for p, n, index in zip(point, normal, chosen, strict=True):
+        members = np.arange(positions._begin[p], positions._begin[p + 1])
+        fit = np.einsum("mi,i->m", mesh.normals[positions._members[members]], n)
+        assert index == members[np.flatnonzero(fit >= fit.max() - 1e-12)[0]]

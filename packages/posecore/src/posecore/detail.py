@@ -92,17 +92,25 @@ class _Positions:
         nearest = np.asarray(self._tree.query(points)[1])[faces]
         edges = points[faces[:, 1:]] - points[faces[:, :1]]
         normals = np.cross(edges[:, 0], edges[:, 1])
-        source = self._members[self._begin[nearest]]
-        best = np.einsum("fki,fi->fk", self._normals[source], normals)
-        for number in range(1, int(np.diff(self._begin).max())):
-            at = self._begin[nearest] + number
-            other = self._members[np.minimum(at, len(self._members) - 1)]
-            fit = np.einsum("fki,fi->fk", self._normals[other], normals)
-            better = (at < self._begin[nearest + 1]) & (fit > best)
-            source, best = np.where(better, other, source), np.where(better, fit, best)
+        source = self._members[self._fitting(nearest.reshape(-1), np.repeat(normals, 3, axis=0))].reshape(faces.shape)
         pairs = np.stack([faces, source], axis=-1).reshape(-1, 2)
         _, first, corner = np.unique(pairs @ [len(self._members), 1], return_index=True, return_inverse=True)
         return pairs[first], corner.reshape(-1, 3)
+
+    def _fitting(self, point: Int[np.ndarray, " c"], normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
+        """Of the members of each point, the index of the first whose normal is nearest to the one given."""
+        index, count = self._begin[point], np.diff(self._begin)[point]
+        several = np.flatnonzero(count > 1)
+        count = count[several]
+        if not len(several):
+            return index
+        start = np.cumsum(count) - count  # of each point's members in the list of all
+        owner = np.repeat(several, count)
+        member = np.arange(len(owner)) + np.repeat(index[several] - start, count)
+        fit = np.einsum("mi,mi->m", self._normals[self._members[member]], normal[owner])
+        best = np.flatnonzero(fit == np.repeat(np.maximum.reduceat(fit, start), count))
+        index[several] = member[best[np.searchsorted(best, start)]]
+        return index
 
 
 class _Surface:
