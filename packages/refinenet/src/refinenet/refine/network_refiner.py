@@ -101,8 +101,6 @@ class Refiner:
         self._min_confidence = min_confidence
         self.device = choose_device(device)
         self._network = loaded.network().to(self.device)
-        if self.device.type == "cpu":
-            self._network.to(memory_format=torch.channels_last)  # faster, the same bits
         self._uses_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
         self._pass = 1 if self.device.type == "cpu" else batch  # poses in a forward pass
