@@ -145,7 +145,7 @@ def decode(file: Path, name: str, data: bytes) -> DecodedImage:
 def _too_large(file: Path, name: str, size: str) -> MeshError:
     return MeshError(
         f"{file}: its texture {name} is too large ({size} pixels), expected at most {LARGEST_SIDE_PX} a side and "
-        f"{LARGEST_AREA_PX >> 20} million in all; scale it down"
+        f"{LARGEST_AREA_PX / 1e6:.0f} million in all; scale it down"
     )
 
 
