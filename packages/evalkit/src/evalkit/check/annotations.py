@@ -12,7 +12,7 @@ from posecore.bop import BopDataset, GroundTruth, ModelInfo
 from posecore.bop.annotations import camera_matrix, depth_scale, ground_truth, visib_fract
 from posecore.bop.jsonfile import numbers
 from posecore.bop.models_info import MM
-from posecore.bop.results import SUSPICIOUS_DISTANCE_MM
+from posecore.bop.results import in_metres
 from posecore.bop.sources import Kind, scenes_of
 from posecore.errors import DatasetError
 from posecore.schema import shown
@@ -45,9 +45,13 @@ class Scenes:
     instance_counts: dict[Image, Counter[int]] = field(default_factory=dict)
     matrices: dict[Image, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
+    def center_m(self, obj_id: int) -> Float[np.ndarray, "3"]:
+        """Centre of an object, its origin where it is unknown; object frame, metres."""
+        return np.asarray(self.centers_m.get(obj_id, np.zeros(3)))
+
     def of_center(self, gt: GroundTruth) -> Float[np.ndarray, "4 4"]:
         """Pose of the object's centre; of the origin of an unknown object."""
-        return se3.with_origin_at(gt.T_cam_obj, self.centers_m.get(gt.obj_id, np.zeros(3)))
+        return se3.with_origin_at(gt.T_cam_obj, self.center_m(gt.obj_id))
 
 
 def check_scenes(
@@ -261,10 +265,9 @@ def _check_info(entry: Any, where: str, findings: Findings) -> None:
 
 
 def _check_units(dataset: BopDataset, scenes: Scenes, findings: Findings) -> None:
-    poses = [gt.T_cam_obj for instances in scenes.instances.values() for gt in instances if gt.has_pose]
-    if not poses:
-        return
-    median_mm = float(np.median(np.linalg.norm(np.array(poses)[:, :3, 3], axis=1))) / MM
-    if median_mm < SUSPICIOUS_DISTANCE_MM:
+    instances = [gt for listed in scenes.instances.values() for gt in listed if gt.has_pose]
+    poses = np.array([gt.T_cam_obj for gt in instances]).reshape(-1, 4, 4)
+    if in_metres(poses, np.array([scenes.center_m(gt.obj_id) for gt in instances]).reshape(-1, 3)):
+        median_mm = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1))) / MM
         message = f"the median length of t of {len(poses)} ground-truth poses is {median_mm:.4g} mm"
         findings.add("error", "units", str(dataset.split_path), message, "metres? BOP files hold millimetres")

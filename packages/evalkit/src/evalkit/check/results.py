@@ -40,6 +40,8 @@ def check_results(path: Path, dataset: BopDataset | None, findings: Findings) ->
     findings.cover("result files")
     findings.cover("estimates", len(table))
     metres = metres_fault(table)
+    if metres is not None and dataset is not None:
+        metres = metres_fault(table, centers_m(dataset, np.unique(table.obj_id).tolist()))
     if metres is not None:
         findings.add("error", "units", f"{path}:{metres.line}", metres.message, "metres?")
     try:

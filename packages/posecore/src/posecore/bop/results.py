@@ -1,7 +1,8 @@
 """BOP result files: `scene_id,im_id,obj_id,score,R,t,time`, millimetres, one estimate a line, with a JSON sidecar."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -9,11 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from posecore import se3
 from posecore.bop.dataset import BopDataset
 from posecore.bop.jsonfile import as_list, read_json
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
-from posecore.errors import ResultFileError
+from posecore.errors import PoseError, ResultFileError
 from posecore.files import read_regular, write_atomic
 from posecore.renamed import migrated_keys
 
@@ -23,6 +25,7 @@ __all__ = [
     "ResultTable",
     "estimate_table",
     "estimates_of",
+    "in_metres",
     "metres_fault",
     "read_result_bytes",
     "read_result_table",
@@ -34,6 +37,8 @@ __all__ = [
 ]
 
 SUSPICIOUS_DISTANCE_MM = 10.0
+NEAREST_MM = 1e-3 * SUSPICIOUS_DISTANCE_MM
+"""Least length that is suspected: in metres, a smaller one would be no nearer to any object."""
 RENAMED = {
     "start_lines": "initial_lines",
     "method=start": "method=initial",
@@ -97,11 +102,14 @@ def read_result_table(
 
     Raises:
         ResultFileError: missing or empty file, a line that breaks the format, NaN, a scaled or mirrored rotation, an
-            unknown id, translations that look like metres. The message names file and line.
+            unknown id, translations that look like metres (`in_metres`; without a dataset, by the origins alone). The
+            message names file and line.
     """
     file = Path(path)
     table = parse_results(read_result_bytes(file), str(file))
     metres = metres_fault(table)
+    if metres is not None and dataset is not None:  # only then, as centres are read from the meshes
+        metres = metres_fault(table, _known_centers_m(table, dataset))
     if metres is not None:
         raise ResultFileError(f"{file}:{metres.line}: {metres.message}")
     if dataset is not None:
@@ -148,19 +156,49 @@ def estimate_table(estimates: Sequence[Estimate]) -> ResultTable:
     )
 
 
-def metres_fault(table: ResultTable) -> LineFault | None:
-    """Fault if a file's translations are probably in metres, else None."""
-    if not len(table):
+def in_metres(T_cam_obj: Float[np.ndarray, "n 4 4"], centers_m: Float[np.ndarray, "n 3"]) -> bool:
+    """Whether translations of BOP files are probably in metres: origins and centres are both about at the camera.
+
+    An origin alone may lie there, as that of a mesh scanned in the camera's frame.
+
+    Args:
+        T_cam_obj: Poses as read, metres.
+        centers_m: Each object's centre in its frame, metres; zeros where it is unknown.
+    """
+    if not len(T_cam_obj):
+        return False
+    origin_mm, center_mm = (
+        float(np.median(np.linalg.norm(T[:, :3, 3], axis=1))) / MM
+        for T in (T_cam_obj, se3.with_origin_at(T_cam_obj, centers_m))
+    )
+    return NEAREST_MM <= origin_mm < SUSPICIOUS_DISTANCE_MM and center_mm < SUSPICIOUS_DISTANCE_MM
+
+
+def metres_fault(table: ResultTable, centers_m: Mapping[int, Float[np.ndarray, "3"]] | None = None) -> LineFault | None:
+    """Fault if a file's translations are probably in metres, else None.
+
+    Args:
+        table: Result file.
+        centers_m: Centres of the objects that are known, object frame, metres.
+    """
+    by_id = centers_m or {}
+    centers = np.array([by_id.get(obj_id, np.zeros(3)) for obj_id in table.obj_id.tolist()]).reshape(-1, 3)
+    if not in_metres(table.T_cam_obj, centers):
         return None
-    # The length, not t_z: an origin off the object may lie beside the camera.
     median_mm = float(np.median(np.linalg.norm(table.T_cam_obj[:, :3, 3], axis=1))) / MM
-    if median_mm >= SUSPICIOUS_DISTANCE_MM:
-        return None
     message = (
         f"the median length of t in the file is {median_mm:.4g}, probably in metres; "
         "BOP result files hold millimetres, multiply t by 1000"
     )
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
+
+
+def _known_centers_m(table: ResultTable, dataset: BopDataset) -> dict[int, Float[np.ndarray, "3"]]:
+    centers = {}
+    for obj_id in np.unique(table.obj_id).tolist():
+        with suppress(PoseError):  # no such model, or a damaged one
+            centers[obj_id] = dataset.center_m(obj_id)
+    return centers
 
 
 def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "camera"] = "gt") -> list[LineFault]:

@@ -27,7 +27,7 @@ class _Metadata(Struct):
     step: _Digits
     dataset_sha256: Name
     objects: str
-    camera_fx_px: Annotated[str, Meta(pattern=r"^[0-9.]{1,32}(e[-+]?[0-9]{1,3})?\Z")]
+    camera_fx_px: Annotated[str, Meta(pattern=r"^[0-9]{1,20}(\.[0-9]{0,40})?(e[-+]?[0-9]{1,2})?\Z")]
 
 
 class _ObjectCard(Struct):

@@ -169,6 +169,7 @@ def track_to_file(
     sequence = open_sequence(job.source, split=job.split, scene=job.scene, camera=job.camera)
     initial_poses = InitialPoses(sequence, job.init, job.pose, job.objects)
     meshes, infos = load_models(sequence, job.mesh_files, job.units, loaded, initial_poses.obj_ids)
+    initial_poses.require_millimetres(meshes)
     for path in filter(None, (job.out, job.video)):
         require_writable(path)
     log, stopped, total = TrackLog(), None, len(sequence) or None
