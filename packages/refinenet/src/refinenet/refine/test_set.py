@@ -166,7 +166,7 @@ def _has_room(folder: Path, dataset: BopDataset, initial: Path, run: Path) -> bo
                 return False
         if refined.exists() and (read_sidecar(refined) or {}).get("run") != str(run.resolve()):
             return False
-        if (folder / INITIAL).exists() and not _same_poses(folder / INITIAL, initial):
+        if (folder / INITIAL).exists() and not _same_poses(folder / INITIAL, initial, dataset):
             return False
         require_writable(folder / INITIAL)
     except (PoseError, OSError):
@@ -174,7 +174,7 @@ def _has_room(folder: Path, dataset: BopDataset, initial: Path, run: Path) -> bo
     return True
 
 
-def _same_poses(file: Path, other: Path) -> bool:
-    a, b = read_result_table(file), read_result_table(other)
+def _same_poses(file: Path, other: Path, dataset: BopDataset) -> bool:
+    a, b = (read_result_table(path, dataset) for path in (file, other))
     ids = (np.array([table.scene_id, table.im_id, table.obj_id]) for table in (a, b))
     return np.array_equal(*ids) and bool(np.allclose(a.T_cam_obj, b.T_cam_obj, rtol=0.0, atol=SAME_POSE))
