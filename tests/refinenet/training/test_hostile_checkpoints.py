@@ -98,7 +98,9 @@ STATES = [
     (lambda state: {**state, "validation_shards": [-1]}, "validation_shards[0] is -1, expected int >= 0"),
     (lambda state: {**state, "optimiser": None}, "optimiser is None, expected object"),
     (lambda state: {key: state[key] for key in state if key != "optimiser"}, "the key optimiser is missing"),
-    (lambda state: {**state, "weights": None}, "weights of another network"),
+    (lambda state: {**state, "weights": None}, "weights is None, expected object"),
+    (lambda state: {key: state[key] for key in state if key != "weights"}, "the key weights is missing"),
+    (lambda state: {**state, "weights": {}}, "weights of another network"),
     (lambda state: {**state, "weights": {key: w * torch.nan for key, w in state["weights"].items()}}, "are NaN or"),
     (lambda state: changed_moment(state, lambda moment: moment * torch.inf), "are NaN or infinite"),
     (lambda state: changed_moment(state, lambda moment: moment[:1].clone()), "expected the shape of weight"),
@@ -121,6 +123,7 @@ def test_an_optimiser_state_out_of_bounds_is_refused(copy, dataset, change, line
     with pytest.raises(CheckpointError) as caught:
         open_run(small("optimiser.ema_decay=0.5"), str(dataset), copy, resume=True)
     one_line(caught.value)
+    assert str(caught.value).startswith(f"{file}: ")
     assert line in str(caught.value)
 
 
