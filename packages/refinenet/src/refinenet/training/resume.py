@@ -21,11 +21,13 @@ class SavedRun:
     """A run on disk.
 
     Attributes:
+        config: Configuration to continue with: the requested one, and the pivot of the run.
         last: Its newest checkpoint.
         state: Optimiser state of the same step.
         state_path: Its file.
     """
 
+    config: TrainConfig
     last: checkpoint.Checkpoint
     state: dict[str, Any]
     state_path: Path
@@ -57,7 +59,8 @@ def load_run(config: TrainConfig, out: Path) -> SavedRun:
     state = checkpoint.load_state(out, last.provenance.step, ema=config.optimiser.ema_decay > 0)
     if config.loader.follow and "validation_shards" not in state:
         raise CheckpointError(f"{out}: a run with --follow of an earlier version, which held out less; start a new run")
-    return SavedRun(last=last, state=state, state_path=checkpoint.state_path(out, last.provenance.step))
+    path = checkpoint.state_path(out, last.provenance.step)
+    return SavedRun(config=config, last=last, state=state, state_path=path)
 
 
 def restore(run: Trainer, saved: SavedRun) -> None:
