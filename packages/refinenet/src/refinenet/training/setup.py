@@ -81,8 +81,8 @@ def build_network(config: TrainConfig, device: torch.device, *, pretrained: bool
         loaded.give_weights(network, config.network)
         if (before := loaded.provenance.config.pivot) != config.pivot:
             log.warning(
-                "%s: its updates are about the %s of meshes, and this run's about the %s: where these lie apart, it has "
-                "to learn them anew; --set pivot=%s keeps them",
+                "%s: its updates are about the %s of meshes, and this run's about the %s: where these lie apart, it "
+                "has to learn them anew; --set pivot=%s keeps them",
                 config.init, before, config.pivot, before,
             )  # fmt: skip
     elif pretrained and isinstance(network, PaperNet) and config.network.backbone.pretrained:
