@@ -19,7 +19,7 @@ from posecore.bop import (
     write_results,
 )
 from posecore.bop.result_table import COLUMNS, parse_results
-from posecore.bop.results import in_metres
+from posecore.bop.results import POINT, Extent, in_metres
 from posecore.errors import DatasetError, ResultFileError
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
@@ -106,8 +106,14 @@ def test_an_origin_at_the_camera_is_not_in_metres(tmp_path):
     (pose,) = read_results(path)
     assert not pose.T_cam_obj[:3, 3].any()
     T = np.array([se3.make_T(np.eye(3), np.array([0.0, 0.0, 0.004]))])
-    assert in_metres(T, np.zeros((1, 3)))
-    assert not in_metres(T, np.array([[0.0, 0.0, 0.6]]))
+    assert in_metres(T, [POINT])
+    assert not in_metres(T, [Extent(np.array([0.0, 0.0, 0.6]), 0.2)])
+
+
+def test_metres_are_suspected_of_an_object_with_its_origin_at_its_side():
+    T = np.array([se3.make_T(np.eye(3), np.array([0.0, 0.0, 5e-4]))])
+    assert in_metres(T, [Extent(np.array([0.0, 0.1, 0.05]), 0.2)])
+    assert not in_metres(T, [Extent(np.array([0.0, 0.1, 0.1]), 0.2)])
 
 
 @pytest.mark.parametrize("text", [HEADER, f"{HEADER}\n\n", f"\n {HEADER} \r\n"])

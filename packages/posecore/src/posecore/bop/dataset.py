@@ -380,7 +380,10 @@ class BopDataset:
 
     def mesh(self, obj_id: int, eval: bool = False) -> Mesh:
         """A model in metres; with `eval` the simplified one that BOP scores with, where there is one."""
-        path = self.mesh_path(obj_id, eval)
+        return self.mesh_at(self.mesh_path(obj_id, eval))
+
+    def mesh_at(self, path: Path) -> Mesh:
+        """A file of a models folder in metres, read once."""
         if path not in self._meshes:
             self._meshes[path] = load_mesh(path, units="mm")
         return self._meshes[path]

@@ -1,11 +1,11 @@
 """BOP result files: `scene_id,im_id,obj_id,score,R,t,time`, millimetres, one estimate a line, with a JSON sidecar."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -21,10 +21,12 @@ from posecore.renamed import migrated_keys
 
 __all__ = [
     "Estimate",
+    "Extent",
     "LineFault",
     "ResultTable",
     "estimate_table",
     "estimates_of",
+    "extents_of",
     "in_metres",
     "metres_fault",
     "read_result_bytes",
@@ -37,6 +39,8 @@ __all__ = [
 ]
 
 SUSPICIOUS_DISTANCE_MM = 10.0
+REACH_DIAMETERS = 0.6
+"""A nearer object reaches the camera."""
 NEAREST_MM = 1e-3 * SUSPICIOUS_DISTANCE_MM
 """Least length that is suspected: in metres, a smaller one would be no nearer to any object."""
 RENAMED = {
@@ -109,7 +113,7 @@ def read_result_table(
     table = parse_results(read_result_bytes(file), str(file))
     metres = metres_fault(table)
     if metres is not None and dataset is not None:  # only then, as centres are read from the meshes
-        metres = metres_fault(table, _known_centers_m(table, dataset))
+        metres = metres_fault(table, extents_of(dataset, np.unique(table.obj_id).tolist()))
     if metres is not None:
         raise ResultFileError(f"{file}:{metres.line}: {metres.message}")
     if dataset is not None:
@@ -156,34 +160,51 @@ def estimate_table(estimates: Sequence[Estimate]) -> ResultTable:
     )
 
 
-def in_metres(T_cam_obj: Float[np.ndarray, "n 4 4"], centers_m: Float[np.ndarray, "n 3"]) -> bool:
-    """Whether translations of BOP files are probably in metres: origins and centres are both about at the camera.
+class Extent(NamedTuple):
+    """Place and size of an object.
+
+    Attributes:
+        center_m: Centre in its frame, metres.
+        diameter_m: Diameter, metres.
+    """
+
+    center_m: Float[np.ndarray, "3"]
+    diameter_m: float
+
+
+POINT = Extent(np.zeros(3), 0.0)
+"""An object that is unknown."""
+
+
+def in_metres(T_cam_obj: Float[np.ndarray, "n 4 4"], extents: Sequence[Extent]) -> bool:
+    """Whether translations of BOP files are probably in metres: origins are at the camera, which is in the objects.
 
     An origin alone may lie there, as that of a mesh scanned in the camera's frame.
 
     Args:
         T_cam_obj: Poses as read, metres.
-        centers_m: Each object's centre in its frame, metres; zeros where it is unknown.
+        extents: Of each pose's object; `POINT` where it is unknown.
     """
     if not len(T_cam_obj):
         return False
+    centers_m = np.array([extent.center_m for extent in extents])
     origin_mm, center_mm = (
-        float(np.median(np.linalg.norm(T[:, :3, 3], axis=1))) / MM
-        for T in (T_cam_obj, se3.with_origin_at(T_cam_obj, centers_m))
+        np.linalg.norm(T[:, :3, 3], axis=1) / MM for T in (T_cam_obj, se3.with_origin_at(T_cam_obj, centers_m))
     )
-    return NEAREST_MM <= origin_mm < SUSPICIOUS_DISTANCE_MM and center_mm < SUSPICIOUS_DISTANCE_MM
+    reach_mm = np.array([REACH_DIAMETERS * extent.diameter_m for extent in extents]) / MM
+    is_at_camera = NEAREST_MM <= float(np.median(origin_mm)) < SUSPICIOUS_DISTANCE_MM
+    return is_at_camera and float(np.median(center_mm / np.maximum(reach_mm, SUSPICIOUS_DISTANCE_MM))) < 1
 
 
-def metres_fault(table: ResultTable, centers_m: Mapping[int, Float[np.ndarray, "3"]] | None = None) -> LineFault | None:
+def metres_fault(table: ResultTable, extents: Mapping[int, Extent] | None = None) -> LineFault | None:
     """Fault if a file's translations are probably in metres, else None.
 
     Args:
         table: Result file.
-        centers_m: Centres of the objects that are known, object frame, metres.
+        extents: Of the objects that are known.
     """
-    by_id = centers_m or {}
-    centers = np.array([by_id.get(obj_id, np.zeros(3)) for obj_id in table.obj_id.tolist()]).reshape(-1, 3)
-    if not in_metres(table.T_cam_obj, centers):
+    by_id = extents or {}
+    if not in_metres(table.T_cam_obj, [by_id.get(obj_id, POINT) for obj_id in table.obj_id.tolist()]):
         return None
     median_mm = float(np.median(np.linalg.norm(table.T_cam_obj[:, :3, 3], axis=1))) / MM
     message = (
@@ -193,12 +214,13 @@ def metres_fault(table: ResultTable, centers_m: Mapping[int, Float[np.ndarray, "
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
 
 
-def _known_centers_m(table: ResultTable, dataset: BopDataset) -> dict[int, Float[np.ndarray, "3"]]:
-    centers = {}
-    for obj_id in np.unique(table.obj_id).tolist():
+def extents_of(dataset: BopDataset, obj_ids: Iterable[int]) -> dict[int, Extent]:
+    """Extent of each object whose model is usable."""
+    extents = {}
+    for obj_id in obj_ids:
         with suppress(PoseError):  # no such model, or a damaged one
-            centers[obj_id] = dataset.center_m(obj_id)
-    return centers
+            extents[obj_id] = Extent(dataset.center_m(obj_id), dataset.mesh(obj_id).diameter_m)
+    return extents
 
 
 def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "camera"] = "gt") -> list[LineFault]:

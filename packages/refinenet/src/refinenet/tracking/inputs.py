@@ -10,7 +10,14 @@ from posecore.bop.annotations import ground_truth
 from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
 from posecore.bop.result_table import parse_results
-from posecore.bop.results import estimate_table, estimates_of, in_metres, metres_fault, read_result_bytes
+from posecore.bop.results import (
+    Extent,
+    estimate_table,
+    estimates_of,
+    in_metres,
+    metres_fault,
+    read_result_bytes,
+)
 from posecore.errors import ConfigError, ResultFileError
 from posecore.mesh import Mesh, Units, load_mesh
 
@@ -73,12 +80,12 @@ class InitialPoses:
             ResultFileError: The result file is.
             ConfigError: A pose of the pose file is.
         """
-        centers_m = {obj_id: mesh.center_m for obj_id, mesh in meshes.items()}
-        metres = metres_fault(estimate_table(self._estimates), centers_m)
+        extents = {obj_id: Extent(mesh.center_m, mesh.diameter_m) for obj_id, mesh in meshes.items()}
+        metres = metres_fault(estimate_table(self._estimates), extents)
         if metres is not None:
             raise ResultFileError(f"{self._file}:{metres.line}: {metres.message}")
         for obj_id, T in ((obj_id, T) for obj_id, poses in self._always.items() for T in poses):
-            if in_metres(T[None], centers_m[obj_id][None]):
+            if in_metres(T[None], [extents[obj_id]]):
                 raise ConfigError(
                     f"{self._file}: a t of length {1e3 * np.linalg.norm(T[:3, 3]):.4g} is probably in metres; "
                     "cam_t_m2c is in millimetres, multiply it by 1000"
