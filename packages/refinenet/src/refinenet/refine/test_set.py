@@ -176,5 +176,5 @@ def _has_room(folder: Path, dataset: BopDataset, initial: Path, run: Path) -> bo
 
 def _same_poses(file: Path, other: Path, dataset: BopDataset) -> bool:
     a, b = (read_result_table(path, dataset) for path in (file, other))
-    ids = (np.array([table.scene_id, table.im_id, table.obj_id]) for table in (a, b))
-    return np.array_equal(*ids) and bool(np.allclose(a.T_cam_obj, b.T_cam_obj, rtol=0.0, atol=SAME_POSE))
+    ids_a, ids_b = (np.array([table.scene_id, table.im_id, table.obj_id]) for table in (a, b))
+    return np.array_equal(ids_a, ids_b) and bool(np.allclose(a.T_cam_obj, b.T_cam_obj, rtol=0.0, atol=SAME_POSE))
