@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from posecore.bop import read_sidecar
+from posecore.errors import ConfigError
 from refinenet.models import checkpoint
 from refinenet.refine.bop_results import RefineJob, refine_result_file
 from refinenet.refine.registry import MethodSettings
@@ -69,6 +70,16 @@ def test_the_working_folder_as_run_keeps_what_it_holds(refined_into):
     again = refined_into(str(Path.cwd()))
     assert again.initial.resolve() == done.initial.resolve()
     assert {path: data for path, data in files().items() if path in before} == before
+
+
+def test_a_file_in_the_run_s_own_folder_that_is_not_the_run_s_is_left(refined_into):
+    for folder in ("results", "test_results"):
+        Path(folder).mkdir()
+        Path(folder, "run.csv").write_text("mine\n")
+    before = files()
+    with pytest.raises(ConfigError, match=r"^test_results/run.csv: is not of this run; move it, and --resume refines"):
+        refined_into(".")
+    assert files() == before
 
 
 @pytest.mark.parametrize(("first", "second"), [("runs/compact", "compact"), ("a/b", "a-b")])

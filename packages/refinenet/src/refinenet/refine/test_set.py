@@ -11,7 +11,7 @@ import numpy as np
 from posecore.bop import BopDataset, read_sidecar
 from posecore.bop.perturbation import Level, perturb_dataset
 from posecore.bop.results import read_result_table, sidecar_path
-from posecore.errors import PoseError
+from posecore.errors import ConfigError, PoseError
 from posecore.files import require_writable, write_atomic
 from posecore.shard.layout import TEST_SET
 
@@ -129,7 +129,7 @@ def refine_test_set(
             program={"refinenet": __version__},
         )  # fmt: skip
         shared = (folder for folder in (RESULTS, job.run / RESULTS) if _has_room(folder, dataset, drawn, job.run))
-        folder = next(shared, job.run / OWN_RESULTS)
+        folder = next(shared, None) or _own_folder(dataset, drawn, job.run)
         initial, refined = folder / INITIAL, folder / name
         for source, target in ((sidecar_path(drawn), sidecar_path(initial)), (drawn, initial)):
             write_atomic(target, source.read_bytes())
@@ -158,13 +158,12 @@ def _has_room(folder: Path, dataset: BopDataset, initial: Path, run: Path) -> bo
         initial: Poses that the folder's own initial poses, if any, must equal.
         run: Whose refined file is replaced.
     """
-    refined = folder / f"{run_name(run)}.csv"
     try:
         for path in (path for searched in (folder.parent, folder) for path in sorted(searched.glob("*.csv"))):
             named = (read_sidecar(path) or {}).get("dataset")
             if named and Path(named).resolve() != dataset.root.resolve():
                 return False
-        if refined.exists() and (read_sidecar(refined) or {}).get("run") != str(run.resolve()):
+        if (folder / f"{run_name(run)}.csv").exists() and not _is_of_run(folder, run):
             return False
         if (folder / INITIAL).exists() and not _same_poses(folder / INITIAL, initial, dataset):
             return False
@@ -172,6 +171,21 @@ def _has_room(folder: Path, dataset: BopDataset, initial: Path, run: Path) -> bo
     except (PoseError, OSError):
         return False
     return True
+
+
+def _own_folder(dataset: BopDataset, initial: Path, run: Path) -> Path:
+    """The folder that a run has for its files alone, which a run in the working folder may find in use."""
+    folder = run / OWN_RESULTS
+    present = [path for path in (folder / INITIAL, folder / f"{run_name(run)}.csv") if path.exists()]
+    is_own = present == [folder / INITIAL] and _same_poses(folder / INITIAL, initial, dataset)
+    if present and not is_own and not _is_of_run(folder, run):
+        raise ConfigError(f"{present[0]}: is not of this run; move it, and --resume refines the test images")
+    return folder
+
+
+def _is_of_run(folder: Path, run: Path) -> bool:
+    """Whether the refined file in a folder is one of this run."""
+    return (read_sidecar(folder / f"{run_name(run)}.csv") or {}).get("run") == str(run.resolve())
 
 
 def _same_poses(file: Path, other: Path, dataset: BopDataset) -> bool:
