@@ -80,6 +80,7 @@ def steps(size: Size) -> Iterator[Step]:
         why="A small refinement network; at the end it refines start poses in the test images.",
         command=words(f"refinenet train shards/ {size.train}"),
         leaves="results/compact.csv",
+        removes=("results/initial.csv", "results/compact.csv"),
         run="runs/compact",
         inside=True,
     )

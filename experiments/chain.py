@@ -22,6 +22,7 @@ class Step:
         why: One line for the reader.
         command: Program and arguments.
         leaves: What it leaves in the working folder; without it the step is not complete, whatever the note says.
+        removes: Files of an earlier command, removed before the step starts anew: its program would keep them.
         inside: Whether it runs in the working folder instead of beside it.
         run: Of a training step: its run folder in the working folder, which `--resume` goes on with after an
             interruption and which is cleared otherwise.
@@ -31,6 +32,7 @@ class Step:
     why: str
     command: tuple[str, ...]
     leaves: str
+    removes: tuple[str, ...] = ()
     inside: bool = False
     run: str | None = None
 
@@ -101,6 +103,8 @@ def run_step(step: Step, work: Path, interrupted: bool) -> None:
             other commands see it for themselves.
     """
     program, arguments = step.command[0], step.command[1:]
+    for name in () if interrupted else step.removes:
+        (work / name).unlink(missing_ok=True)
     if step.run is not None:
         if interrupted and (work / step.run / "last.safetensors").is_file():
             arguments = (*arguments, "--resume")
@@ -110,6 +114,8 @@ def run_step(step: Step, work: Path, interrupted: bool) -> None:
     code = subprocess.run([executable(program), *arguments], cwd=work if step.inside else None).returncode
     if code:
         raise SystemExit(f"Error: {program} {arguments[0]} ended with exit code {code}; the reason stands above")
+    if not (work / step.leaves).exists():
+        raise SystemExit(f"Error: {program} {arguments[0]} left no {work / step.leaves}; the reason stands above")
 
 
 def marked(mark: Path, step: Step, state: str) -> bool:

@@ -73,6 +73,9 @@ CARDS = [
     ("n", 10**18, "n is 1000000000000000000, expected int <= 1000000000"),
     ("n", "4", "n is '4', expected int"),
     ("n", ABSENT, "the key n is missing"),
+    ("n", 10**9, "n is 1000000000, expected at most 4194304 shards of 2"),
+    ("shard_size", 1e6, "shard_size is 1000000.0, expected int"),
+    ("shard_size", 10**7, "shard_size is 10000000, expected int <= 1000000"),
     ("shard_size", 0, "shard_size is 0, expected int >= 1"),
     ("patch_px", 1e6, "patch_px is 1000000.0, expected int"),
     ("patch_px", 10**6, "patch_px is 1000000, expected int <= 4096"),
@@ -85,14 +88,17 @@ CARDS = [
     ("objects.1", None, "objects.'1': the content is None, expected object"),
     ("objects.1.path", "../../etc/passwd", "objects.'1': path is '../../etc/passwd', expected str matching"),
     ("objects.1.path", "models/../../a.ply", "objects.'1': path is 'models/../../a.ply', expected str matching"),
+    ("objects.1.texture", "../x.png", "objects.'1': texture is '../x.png', expected str matching"),
     ("objects.1.window_side_px", -1, "objects.'1': window_side_px is -1, expected float > 0.0"),
     ("objects.1.name", "\x1b[2J", "objects.'1': name is '\\x1b[2J', expected str matching"),
     ("camera", None, "camera is None, expected object"),
     ("camera.fx", 0, "camera.fx is 0, expected float >= 0.01"),
+    ("camera.cx", 1e300, "camera.cx is 1e+300, expected float <= 10000000.0"),
     ("camera.fx", 1e300, "camera.fx is 1e+300, expected float <= 10000000.0"),
     ("units", [1], "units is [1], expected object"),
     ("versions", {"a": 1}, "versions[...] is {'a': 1}, expected str"),
     ("merged", [{}], "the key merged[0].digest is missing"),
+    ("merged", [{"digest": "0", "card": {"n": -1}}], "merged[0]: card.'0': n is -1, expected int >= 1"),
     ("config", 3, "config is 3, expected object"),
 ]
 
@@ -104,6 +110,13 @@ def test_a_card_with_a_wrong_value_is_refused_by_every_command(shards, tmp_path,
     error = error_of(*commands(shards, tmp_path)[name])
     assert f"Error: {shards}/zarr.json: " in error
     assert line in error
+
+
+def test_a_card_of_shards_that_fit_no_memory_is_refused(shards, tmp_path):
+    changed(shards, "shard_size", 1000)
+    changed(shards, "patch_px", 4096)
+    words = "shard_size is 1000 with patch_px 4096, expected at most 2147483648 pixels in a shard"
+    assert words in error_of(*commands(shards, tmp_path)["info"])
 
 
 RAW = {

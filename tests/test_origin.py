@@ -16,13 +16,16 @@ from evalkit.cli import main as evalkit
 from evalkit.evaluation.evaluator import evaluate
 from posecore import se3
 from posecore.bop import (
+    BopDataset,
     BopWriter,
+    Estimate,
     FrameRecord,
     GroundTruth,
     ModelInfo,
     read_results,
     read_sidecar,
     write_models,
+    write_results,
 )
 from posecore.camera import Camera, intrinsics
 from posecore.mesh import Mesh, load_mesh, save_ply
@@ -285,6 +288,55 @@ def test_the_check_has_nothing_to_say_of_a_shifted_copy(copies):
         findings = check(root, [root / "start.csv"])
         assert findings.ok, findings.lines()
         assert not any("behind" in line or "off-image" in line for line in findings.lines())
+
+
+@pytest.fixture(scope="session")
+def scanned(tug_ply, tmp_path_factory) -> Path:
+    """A dataset of a mesh in the frame of the camera that scanned it: t is 0 in one image, some mm in the other."""
+    root = tmp_path_factory.mktemp("scanned") / "toys"
+    rng, plain = np.random.default_rng(5), load_mesh(tug_ply)
+    T_scan = se3.make_T(se3.random_rotation(rng), np.array([0.05, 0.01, 0.55]))
+    mesh = replace(
+        plain, vertices_m=plain.vertices_m @ T_scan[:3, :3].T + T_scan[:3, 3], normals=plain.normals @ T_scan[:3, :3].T
+    )
+    moved = se3.make_T(np.eye(3), np.array([0.002, 0.001, -0.004]))
+    size = (CAMERA.width_px, CAMERA.height_px)
+    with Rasteriser({TUG: mesh}) as rasteriser, BopWriter(root, "test", 1) as writer:
+        for im_id, T in enumerate((np.eye(4), moved, moved)):
+            layers = rasteriser.render_scene([Instance(obj_id=TUG, T_cam_obj=T)], CAMERA.K, *size)
+            gt, mask = GroundTruth(obj_id=TUG, T_cam_obj=T), layers.instance == 0
+            record = FrameRecord(
+                rgb=layers.rgb, depth_m=layers.depth_m, camera=CAMERA, gts=[gt], masks=[mask], masks_visib=[mask]
+            )
+            writer.add_frame(im_id, record)
+    write_models(root, {TUG: mesh}, {})
+    return root
+
+
+def test_a_mesh_of_the_camera_s_own_frame_is_not_in_metres(scanned, tmp_path):
+    poses = [
+        Estimate(scene_id=1, im_id=im_id, obj_id=TUG, T_cam_obj=gt.T_cam_obj)
+        for im_id in range(3)
+        for gt in BopDataset(scanned).gt(1, im_id)
+    ]
+    init = tmp_path / "init_toys-test.csv"
+    write_results(init, poses)
+    assert len(read_results(init, BopDataset(scanned))) == 3
+    findings = check(scanned, [init])
+    assert findings.ok, findings.lines()
+    method = ("--method", "edge-icp", "--threads", 1, "--quiet")
+    run(refinenet, "refine", "--dataset", scanned, "--init", init, "--out", tmp_path / "refined.csv", *method)
+    run(refinenet, "track", "--dataset", scanned, "--init", init, "--out", tmp_path / "track.csv", *method)
+    entry = {"obj_id": TUG, "cam_R_m2c": np.eye(3).ravel().tolist(), "cam_t_m2c": [0.5, 0.0, 0.1]}
+    (tmp_path / "pose.json").write_text(json.dumps([entry]))
+    K = {name: float(CAMERA.K[row]) for name, row in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2)))}
+    (tmp_path / "cam.json").write_text(json.dumps(K))
+    files = ("--pose", tmp_path / "pose.json", "--camera", tmp_path / "cam.json")
+    mesh = scanned / f"models/obj_{TUG:06d}.ply"
+    images = scanned / "test/000001/rgb"
+    run(refinenet, "track", images, *files, "--mesh", mesh, "--out", tmp_path / "images.csv", *method)
+    for name in ("refined", "track", "images"):
+        assert len((tmp_path / f"{name}.csv").read_text().splitlines()) == 4, name
 
 
 SMALL = [

@@ -6,6 +6,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -104,6 +105,25 @@ def test_an_interrupted_step_is_told_so(tmp_path: Path, monkeypatch: pytest.Monk
     chain.run_all(tmp_path, everything)
     assert ran[0] == ("train", True)
     assert ran[1][0] == "refine-shipped"
+
+
+def train_step(command: str, size: str = "") -> chain.Step:
+    """The quick start's training step with a shell command for a program."""
+    (step,) = (step for step in quickstart().steps(quickstart().SMOKE) if step.name == "train")
+    return replace(step, command=("sh", "-c", command, size))
+
+
+def test_results_of_an_earlier_command_are_not_those_of_a_step(tmp_path: Path) -> None:
+    results = [tmp_path / "results" / name for name in ("initial.csv", "compact.csv")]
+    write = f"mkdir -p results runs/compact && touch {' '.join(f'results/{path.name}' for path in results)}"
+    chain.run_all(tmp_path, [train_step(write)])
+    # As `refinenet train`, which leaves results of other poses as they are and writes its own elsewhere.
+    elsewhere = f"test -e results/initial.csv || {{ {write}; }}"
+    before = results[1].stat().st_mtime_ns
+    chain.run_all(tmp_path, [train_step(elsewhere, "larger")])
+    assert results[1].stat().st_mtime_ns > before
+    with pytest.raises(SystemExit, match=r"left no .*results/compact\.csv"):
+        chain.run_all(tmp_path, [train_step("exit 0")])
 
 
 def summary_with(vss_gain: float, xy: float, rotation: float, missing: int = 0) -> dict:

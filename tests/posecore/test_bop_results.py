@@ -19,6 +19,7 @@ from posecore.bop import (
     write_results,
 )
 from posecore.bop.result_table import COLUMNS, parse_results
+from posecore.bop.results import POINT, Extent, in_metres
 from posecore.errors import DatasetError, ResultFileError
 
 HEADER = "scene_id,im_id,obj_id,score,R,t,time"
@@ -97,6 +98,22 @@ def test_metres_are_suspected(tmp_path):
     path.write_text(f"{HEADER}\n1,2,3,0.5,1 0 0 0 1 0 0 0 1,0.01 0.02 0.9,-1\n")
     with pytest.raises(ResultFileError, match=r"r.csv:2: the median length of t in the file is 0\.9.*in metres"):
         read_results(path)
+
+
+def test_an_origin_at_the_camera_is_not_in_metres(tmp_path):
+    path = tmp_path / "r.csv"
+    path.write_text(f"{HEADER}\n1,2,3,0.5,1 0 0 0 1 0 0 0 1,0 0 0,-1\n")
+    (pose,) = read_results(path)
+    assert not pose.T_cam_obj[:3, 3].any()
+    T = np.array([se3.make_T(np.eye(3), np.array([0.0, 0.0, 0.004]))])
+    assert in_metres(T, [POINT])
+    assert not in_metres(T, [Extent(np.array([0.0, 0.0, 0.6]), 0.2)])
+
+
+def test_metres_are_suspected_of_an_object_with_its_origin_at_its_side():
+    T = np.array([se3.make_T(np.eye(3), np.array([0.0, 0.0, 5e-4]))])
+    assert in_metres(T, [Extent(np.array([0.0, 0.1, 0.05]), 0.2)])
+    assert not in_metres(T, [Extent(np.array([0.0, 0.1, 0.1]), 0.2)])
 
 
 @pytest.mark.parametrize("text", [HEADER, f"{HEADER}\n\n", f"\n {HEADER} \r\n"])

@@ -66,6 +66,24 @@ def test_errors_are_the_distances_between_the_surfaces(ball: Mesh, number: int) 
     assert distances.max() / ball.diameter_m <= 1.05 * level.max_error
 
 
+@pytest.mark.parametrize("change", ["faces are missing", "a face too many"])
+def test_errors_are_measured_from_both_surfaces(monkeypatch: pytest.MonkeyPatch, change: str) -> None:
+    """A level that lacks half of the mesh is on it everywhere; one with a face beside it is near to all of the mesh."""
+    plain = rough_ball(4)
+
+    def simplified(points: np.ndarray, faces: np.ndarray, **_: object) -> tuple[np.ndarray, np.ndarray]:
+        if change == "faces are missing":
+            return points, faces[points[faces].mean(axis=1)[:, 2] > 0]
+        if len(points) > plain.vertices_m.shape[0]:
+            return points, faces
+        beside = np.float32([[0, 0, 150], [1, 0, 150], [0, 1, 150]])  # millimetres
+        return np.concatenate([points, beside]), np.concatenate([faces, [np.arange(3) + len(points)]]).astype(np.int32)
+
+    monkeypatch.setattr(detail.fast_simplification, "simplify", simplified)
+    ball = with_levels(plain)
+    assert ball.levels and min(level.max_error for level in ball.levels) > 0.5
+
+
 @pytest.mark.parametrize("side_px", [24, 64, 160])
 def test_a_render_shows_the_mesh_to_a_tenth_of_a_pixel(ball: Mesh, side_px: int) -> None:
     """Silhouettes by a tenth of a pixel of the outline, depths by what a tenth of a pixel changes, colours by noise."""

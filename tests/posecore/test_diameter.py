@@ -53,6 +53,15 @@ def test_it_is_the_largest_of_all_distances(name: str) -> None:
     assert diameter(points) == brute_force(points)
 
 
+def test_it_is_exact_whichever_pairs_are_compared_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few pairs of blocks at a time: the rest is left out only where its bound is below a distance that was found."""
+    monkeypatch.setattr(module, "_PAIRS_AT_ONCE", 4)
+    ball = sphere(3)
+    for seed in range(20):
+        points = ball * (1 + 0.02 * np.random.default_rng(seed).random((len(ball), 1)))
+        assert diameter(points) == brute_force(points)
+
+
 def test_fewer_than_two_points_have_none() -> None:
     assert diameter(np.zeros((0, 3))) == diameter(np.ones((1, 3))) == diameter(np.ones((5, 3))) == 0.0
 

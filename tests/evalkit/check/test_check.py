@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections import Counter
 
 import cv2
 import numpy as np
@@ -10,9 +11,11 @@ import pytest
 from bop_folders import name_sensor, write_rendered, write_shards
 from click.testing import CliRunner
 from evalkit.check import Findings, check
+from evalkit.check import models as check_models
 from evalkit.cli.check import check as command
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, write_results
+from posecore.bop import dataset as dataset_module
 from posecore.mesh import load_mesh
 
 TUG, BOBBIN = 1, 5
@@ -53,6 +56,24 @@ def perfect(root, **changes):
 
 def lines(findings, level, kind):
     return [str(v) for v in findings.violations if (v.level, v.kind) == (level, kind)]
+
+
+def test_every_model_is_read_once(root, tmp_path, monkeypatch):
+    """Also for result files, and for the ground truth against itself."""
+    shutil.copytree(root / "models", root / "models_eval")
+    files = [tmp_path / f"{name}_toys-test.csv" for name in ("one", "two")]
+    for file in files:
+        write_results(file, perfect(root))
+    read = Counter()
+
+    def counted(path, **options):
+        read[path.relative_to(root)] += 1
+        return load_mesh(path, **options)
+
+    monkeypatch.setattr(dataset_module, "load_mesh", counted)
+    monkeypatch.setattr(check_models, "load_mesh", counted, raising=False)
+    check(root, files)
+    assert len(read) == 4 and set(read.values()) == {1}, read
 
 
 def test_a_sound_dataset_and_its_own_poses_pass_without_a_word(root, tmp_path):

@@ -17,13 +17,16 @@ from evalkit.inputs.pairing import MatchedPose, pair_up
 from evalkit.inputs.result_files import ResultFile, load_result_files
 from evalkit.pose_errors import silhouettes
 from evalkit.pose_errors.metrics import vss
+from evalkit.pose_errors.scorer import Scorer
 from evalkit.pose_errors.silhouettes import Patch
 from evalkit.report.summary import initial_of
 from evalkit.scores import by_object, scores
 from evalkit.scores.convergence import by_level
 from posecore import se3
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth, symmetry_transforms, write_results, write_targets
+from posecore.bop import dataset as dataset_module
 from posecore.errors import DatasetError, RenderError, ResultFileError
+from posecore.mesh import load_mesh
 
 from ..conftest import BOBBIN, CAMERA, IMAGES, TUG
 
@@ -49,6 +52,23 @@ def test_truth_scores_perfectly(dataset, perfect, kind):
     total = scores(rows)
     assert [total[key] for key in ("vss_mean", "add_recall_0.1d", "adi_auc_100mm", "ar_mssd", "ar_mspd")] == [1.0] * 5
     assert (total["5cm5deg"], total["proj_5px"], total["diverged"], total["missing"]) == (1.0, 1.0, 0.0, 0)
+
+
+def test_a_scorer_that_knows_the_centres_reads_no_full_model(dataset_path, tmp_path, monkeypatch):
+    root = shutil.copytree(dataset_path, tmp_path / "toys")
+    shutil.copytree(root / "models", root / "models_eval")
+    center_m, read = BopDataset(root).center_m(TUG), []
+
+    def noted(path, **options):
+        read.append(path.parent.name)
+        return load_mesh(path, **options)
+
+    monkeypatch.setattr(dataset_module, "load_mesh", noted)
+    scorer = Scorer(BopDataset(root), visible=False, with_vsd=False)
+    scorer.centers_m.update({TUG: center_m})
+    np.testing.assert_array_equal(scorer.model(TUG).center_m, center_m)
+    scorer.rasteriser.close()
+    assert read == ["models_eval"]
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from evalkit.cli import main
 from evalkit.inputs.perturbation import PROTOCOLS, PerturbJob, protocol_deviations
 from posecore.bop import BopDataset, read_results, read_sidecar
+from posecore.bop.perturbation import Level, perturb_dataset
 from posecore.errors import ConfigError
 
 
@@ -93,6 +94,21 @@ def test_depth_stretch_moves_random_starts_along_the_ray_alone_and_says_how_far(
     without = perturb("--dataset", dataset_path, "--out", tmp_path / "x.csv", "--angles", "5", "--depth-stretch", "4")
     assert without.exit_code == 2
     assert without.stderr == "Error: --depth-stretch needs a random initial pose; give --random-translation too\n"
+
+
+def test_a_start_behind_the_camera_names_the_parameter_and_the_command_its_option(dataset_path, tmp_path):
+    up_to, dataset, out = Level(angle_deg=0.0, translation_diameter=3.0), BopDataset(dataset_path), tmp_path / "x.csv"
+    with pytest.raises(
+        ConfigError, match=r"^depth_stretch 20: puts .*; lower it or random_up_to.translation_diameter$"
+    ):
+        perturb_dataset(dataset, out, levels=(), seed=0, random_up_to=up_to, depth_stretch=20.0)
+    with pytest.raises(ConfigError, match=r"^levels and random_up_to: found neither, expected one at least$"):
+        perturb_dataset(dataset, out, levels=(), seed=0)
+    options = ("--random-up-to", "0", "--random-translation", "3", "--depth-stretch", "20")
+    behind = perturb("--dataset", dataset_path, "--out", out, *options)
+    assert behind.exit_code == 2
+    assert behind.stderr.startswith("Error: --depth-stretch 20: puts object")
+    assert behind.stderr.endswith("behind the camera; lower it or --random-translation\n")
 
 
 def test_an_unknown_protocol_is_refused():

@@ -211,7 +211,20 @@ def test_an_unknown_suffix_is_refused(tmp_path):
         write_tables(tmp_path / "out.docx", [table_of()])
 
 
-FORMULAS = ["=HYPERLINK(1)", "+1+1", "-cmd|x", "@SUM(1)", "\t=1", "'=1", "'"]
+FORMULAS = [
+    "=HYPERLINK(1)",
+    "+1+1",
+    "-cmd|x",
+    "@SUM(1)",
+    "\t=1",
+    "'=1",
+    "'",
+    "-1 (A1)",
+    "-1 [1, 2]+A1",
+    "-1-1",
+    "--",
+    "-1(2)",
+]
 
 
 @pytest.mark.parametrize("name", FORMULAS)
@@ -223,7 +236,9 @@ def test_a_name_in_a_csv_is_no_formula(name):
     assert line[0] == cell
 
 
-@pytest.mark.parametrize("text", ["lmo", "a=b", "-0.5", "+1e3", "", "it's"])
+@pytest.mark.parametrize(
+    "text", ["lmo", "a=b", "-0.5", "+1e3", "", "it's", "-", "-0.01 (-0.02 to 0.01)", "-1.5 [-2, -1.0]", "-3 % (4)"]
+)
 def test_other_cells_of_a_csv_stay(text):
     assert csv_cells.escaped(text) == text
     assert csv_cells.unescaped(text) == text

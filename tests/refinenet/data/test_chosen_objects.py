@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 from posecore.bop.models_info import save_models_info
-from posecore.errors import ConfigError
+from posecore.errors import ConfigError, ShardError
 from posecore.mesh import save_ply
 from posecore.shard import ShardReader, ShardWriter
 from refinenet.data.growing_split import GrowingSplit, wait_for_start
@@ -113,3 +113,12 @@ def test_an_unknown_object_is_one_line(two_objects, cli, tmp_path):
     result = cli("train", two_objects, "--object", 7, "--out", tmp_path / "run", "--quiet")
     assert result.exit_code == 2
     assert "there is no object 7" in result.stderr
+
+
+def test_a_data_card_without_objects_is_named(dataset, tmp_path):
+    copy = shutil.copytree(dataset, tmp_path / "shards")
+    group = json.loads((copy / "zarr.json").read_text())
+    del group["attributes"]["objects"]
+    (copy / "zarr.json").write_text(json.dumps(group))
+    with pytest.raises(ShardError, match="the data card has no objects; make it with `synthgen render`"):
+        open_run(small(), str(copy), tmp_path / "run")

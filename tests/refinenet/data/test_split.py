@@ -175,7 +175,7 @@ def test_a_run_that_an_earlier_version_began_does_not_follow_on(growing, tmp_pat
     run.save(None)
     state = checkpoint.load_state(tmp_path, 0)
     del state["validation_shards"]
-    monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state)
+    monkeypatch.setattr(checkpoint, "load_state", lambda folder, step, ema: state)
     with pytest.raises(CheckpointError, match="of an earlier version, which held out less; start a new run"):
         open_run(small(*options), str(growing[0]), tmp_path, resume=True)
 

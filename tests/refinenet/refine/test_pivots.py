@@ -18,6 +18,7 @@ from refinenet.models import checkpoint
 from refinenet.refine.input_checks import pivots_m
 from refinenet.refine.network_refiner import Refiner
 from refinenet.refiner import Frame, Refinement, Request, Status
+from refinenet.training.setup import build_network
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
@@ -106,6 +107,20 @@ def test_members_of_a_category_of_version_1_have_the_origin_that_they_share(of_o
     np.testing.assert_array_equal(pivots_m(category, {2: other})[2], np.zeros(3))
     now = replace(category.provenance, config=replace(config, pivot="center"))
     np.testing.assert_array_equal(pivots_m(replace(category, provenance=now), {2: other})[2], other.center_m)
+
+
+def test_a_run_that_begins_with_updates_about_another_point_says_so(of_off_center, caplog):
+    config = checkpoint.load(of_off_center["now"]).provenance.config
+    for name, pivot, lines in (("now", "center", 0), ("before", "center", 1), ("before", "origin", 0)):
+        caplog.clear()
+        begun = replace(config, init=str(of_off_center[name]), pivot=pivot)
+        build_network(begun, torch.device("cpu"), pretrained=True)
+        assert len(caplog.messages) == lines
+        for line in caplog.messages:
+            assert line.startswith(
+                f"{begun.init}: its updates are about the origin of meshes, and this run's about the"
+            )
+            assert line.endswith("--set pivot=origin keeps them")
 
 
 def test_shipped_checkpoints_of_version_1_still_have_the_origin_of_the_tug(repository, tug_ply):

@@ -8,6 +8,7 @@ from posecore.errors import ConfigError
 from posecore.mesh import Mesh
 from posecore.symmetry import ContinuousSymmetry, nearest_symmetric
 from refinenet.refiner import Frame, Refinement, Status
+from refinenet.tracking import tracker as tracker_module
 from refinenet.tracking.state import (
     Observation,
     TrackingConfig,
@@ -121,6 +122,12 @@ def test_copies_of_discrete_symmetries_and_balls():
     np.testing.assert_array_equal(nearest_symmetric(spun, before, plain), spun)
 
 
+def symmetric_copy(info):
+    """A transform that maps the object onto itself, not the identity."""
+    (axis,) = info.symmetries_continuous or (None,)
+    return info.symmetries_discrete[0] if axis is None else turned_about(*axis, 2.0)
+
+
 class Script:
     """A method whose confidences are written down; poses come back as `moved` makes them."""
 
@@ -187,6 +194,26 @@ def test_a_symmetric_object_keeps_its_spin_through_a_track():
     found = [tracker.step(i, EMPTY, {1: [pose(7)]})[0].T_cam_obj for i in range(10)]
     for later in found[1:]:
         np.testing.assert_allclose(later, found[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("turned", [{"symmetries_continuous": (AXIS,)}, {"symmetries_discrete": (HALF_TURN,)}])
+def test_spins_are_compared_between_poses_of_one_point(monkeypatch, turned):
+    """A mesh with its origin 0.5 m off: the pose before is given as one of the origin, as the new one is."""
+    shift_m = np.array([0.3, -0.4, 0.0])
+    far = {1: SMALL[1].with_origin_at(-shift_m)}
+    info = ModelInfo(diameter_m=0.1, **turned).with_origin_at(-shift_m)
+    T, compared = se3.with_origin_at(pose(7), -shift_m), []
+
+    def nearest(T_cam_obj, T_reference, symmetries):
+        compared.append(far[1].center_cam_m(T_cam_obj) - far[1].center_cam_m(T_reference))
+        return nearest_symmetric(T_cam_obj, T_reference, symmetries)
+
+    monkeypatch.setattr(tracker_module, "nearest_symmetric", nearest)
+    spins = iter([np.eye(4), symmetric_copy(info)])
+    tracker = Tracker(Script([0.9] * 2, moved=lambda T: T @ next(spins), meshes=far), [1], CONFIG, symmetries={1: info})
+    found = [tracker.step(i, EMPTY, {1: [T]})[0].T_cam_obj for i in range(2)]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+    assert len(compared) == 1 and np.linalg.norm(compared[0]) < 0.1
 
 
 def test_each_depth_is_asked_for():

@@ -323,7 +323,11 @@ def test_track_errors_are_one_line(cli, scene, still, tmp_path):
         (["--dataset", root, *init, *camera], 2, "--camera is for images and videos"),
         (["--dataset", root, *init, "--fps", 10], 2, "--fps has no effect without --video; leave it out"),
         ([images, *pose, *camera, "--split", "test"], 2, "--split is for BOP datasets"),
-        ([images, "--pose", tmp_path / "metres.json", *camera], 2, "a t of length 0.5 is probably in metres"),
+        (
+            [images, "--pose", tmp_path / "metres.json", *camera, "--mesh", mesh_file],
+            2,
+            "a t of length 0.5 is probably in metres",
+        ),
         ([images, *pose, "--camera", tmp_path / "big.json", "--mesh", mesh_file], 1, f"expected {WIDTH_PX + 1} x"),
         ([tmp_path / "twins", *pose, *camera], 1, "01.png and 1.png have one number"),
         (["--dataset", root, *init, "--video", root / "start.csv"], 2, "--video and --init are both"),

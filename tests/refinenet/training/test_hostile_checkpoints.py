@@ -50,6 +50,9 @@ def spoil(file, **metadata):
         ({"step": "-5"}, "step is '-5', expected str matching"),
         ({"step": None}, "the key step is missing"),
         ({"camera_fx_px": "nan"}, "camera_fx_px is 'nan', expected str matching"),
+        ({"camera_fx_px": "1.2.3"}, "camera_fx_px is '1.2.3', expected str matching"),
+        ({"camera_fx_px": "."}, "camera_fx_px is '.', expected str matching"),
+        ({"camera_fx_px": "9e999"}, "camera_fx_px is '9e999', expected str matching"),
         ({"objects": "null"}, "objects: found null, expected JSON"),
         ({"objects": "{}"}, "objects has other keys than object ids, or none"),
         ({"objects": '{"1": {"window_side_px": 1e300, "diameter_m": 1}}'}, "objects.'1': window_side_px is 1e+300"),
@@ -95,7 +98,9 @@ STATES = [
     (lambda state: {**state, "validation_shards": [-1]}, "validation_shards[0] is -1, expected int >= 0"),
     (lambda state: {**state, "optimiser": None}, "optimiser is None, expected object"),
     (lambda state: {key: state[key] for key in state if key != "optimiser"}, "the key optimiser is missing"),
-    (lambda state: {**state, "weights": None}, "weights of another network"),
+    (lambda state: {**state, "weights": None}, "weights is None, expected object"),
+    (lambda state: {key: state[key] for key in state if key != "weights"}, "the key weights is missing"),
+    (lambda state: {**state, "weights": {}}, "weights of another network"),
     (lambda state: {**state, "weights": {key: w * torch.nan for key, w in state["weights"].items()}}, "are NaN or"),
     (lambda state: changed_moment(state, lambda moment: moment * torch.inf), "are NaN or infinite"),
     (lambda state: changed_moment(state, lambda moment: moment[:1].clone()), "expected the shape of weight"),
@@ -118,6 +123,7 @@ def test_an_optimiser_state_out_of_bounds_is_refused(copy, dataset, change, line
     with pytest.raises(CheckpointError) as caught:
         open_run(small("optimiser.ema_decay=0.5"), str(dataset), copy, resume=True)
     one_line(caught.value)
+    assert str(caught.value).startswith(f"{file}: ")
     assert line in str(caught.value)
 
 

@@ -80,7 +80,7 @@ def test_a_disk_full_at_any_write_of_a_checkpoint_keeps_the_one_before(
 @pytest.mark.slow
 def test_a_run_is_not_resumed_under_other_circumstances(undisturbed, dataset, tmp_path, monkeypatch):
     state = checkpoint.load_state(undisturbed, 6)
-    monkeypatch.setattr(checkpoint, "load_state", lambda folder, step: state | {"world": 4})
+    monkeypatch.setattr(checkpoint, "load_state", lambda folder, step, ema: state | {"world": 4})
     with pytest.raises(ConfigError, match=r"trained by 4 processes and now there are 1; resume with torchrun"):
         open_run(small(*AVERAGED), str(dataset), undisturbed, resume=True)
     monkeypatch.undo()

@@ -12,7 +12,7 @@ from posecore.bop import BopDataset, GroundTruth, ModelInfo
 from posecore.bop.annotations import camera_matrix, depth_scale, ground_truth, visib_fract
 from posecore.bop.jsonfile import numbers
 from posecore.bop.models_info import MM
-from posecore.bop.results import SUSPICIOUS_DISTANCE_MM
+from posecore.bop.results import POINT, Extent, in_metres
 from posecore.bop.sources import Kind, scenes_of
 from posecore.errors import DatasetError
 from posecore.schema import shown
@@ -32,32 +32,36 @@ class Scenes:
     """Usable annotations of a split.
 
     Attributes:
-        centers_m: centre of each object, object frame, metres.
+        extents: of each object with a usable model.
         images: images with a camera, in order.
         instances: usable annotations of each image with ground truth.
         instance_counts: number of poses of each object in each image with ground truth.
         matrices: valid camera matrices by image.
     """
 
-    centers_m: Mapping[int, Float[np.ndarray, "3"]] = field(default_factory=dict)
+    extents: Mapping[int, Extent] = field(default_factory=dict)
     images: list[Image] = field(default_factory=list)
     instances: dict[Image, list[GroundTruth]] = field(default_factory=dict)
     instance_counts: dict[Image, Counter[int]] = field(default_factory=dict)
     matrices: dict[Image, Float[np.ndarray, "3 3"]] = field(default_factory=dict)
 
+    def extent(self, obj_id: int) -> Extent:
+        """Extent of an object, a point where it is unknown."""
+        return self.extents.get(obj_id, POINT)
+
     def of_center(self, gt: GroundTruth) -> Float[np.ndarray, "4 4"]:
         """Pose of the object's centre; of the origin of an unknown object."""
-        return se3.with_origin_at(gt.T_cam_obj, self.centers_m.get(gt.obj_id, np.zeros(3)))
+        return se3.with_origin_at(gt.T_cam_obj, self.extent(gt.obj_id).center_m)
 
 
 def check_scenes(
     dataset: BopDataset,
     infos: Mapping[int, ModelInfo],
-    centers_m: Mapping[int, Float[np.ndarray, "3"]],
+    extents: Mapping[int, Extent],
     findings: Findings,
 ) -> Scenes:
     """Check every annotation of every scene."""
-    scenes = Scenes(centers_m=centers_m)
+    scenes = Scenes(extents=extents)
     if not dataset.is_sharded:
         for folder, sensors in scenes_of(dataset.split_path).items():
             if not sensors:
@@ -261,10 +265,9 @@ def _check_info(entry: Any, where: str, findings: Findings) -> None:
 
 
 def _check_units(dataset: BopDataset, scenes: Scenes, findings: Findings) -> None:
-    poses = [gt.T_cam_obj for instances in scenes.instances.values() for gt in instances if gt.has_pose]
-    if not poses:
-        return
-    median_mm = float(np.median(np.linalg.norm(np.array(poses)[:, :3, 3], axis=1))) / MM
-    if median_mm < SUSPICIOUS_DISTANCE_MM:
+    instances = [gt for listed in scenes.instances.values() for gt in listed if gt.has_pose]
+    poses = np.array([gt.T_cam_obj for gt in instances]).reshape(-1, 4, 4)
+    if in_metres(poses, [scenes.extent(gt.obj_id) for gt in instances]):
+        median_mm = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1))) / MM
         message = f"the median length of t of {len(poses)} ground-truth poses is {median_mm:.4g} mm"
         findings.add("error", "units", str(dataset.split_path), message, "metres? BOP files hold millimetres")

@@ -1,6 +1,6 @@
 """Models against `models_info.json`: loading, diameters, boxes and symmetries."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,8 @@ from posecore import se3
 from posecore.bop import BopDataset, ModelInfo
 from posecore.bop.jsonfile import integer_keys, numbers, read_json
 from posecore.bop.models_info import MM, load_model_info
-from posecore.errors import DatasetError, MeshError, PoseError
-from posecore.mesh import Mesh, load_mesh
+from posecore.errors import DatasetError, MeshError
+from posecore.mesh import Mesh
 from posecore.symmetry import rotations_about_axis
 from scipy.spatial import cKDTree
 
@@ -47,19 +47,8 @@ def check_models(dataset: BopDataset, findings: Findings) -> dict[int, ModelInfo
     if not folders:
         findings.add("error", "models", str(dataset.root), "found no models/ folder, expected models/obj_000001.ply")
     for folder in folders:
-        _check_folder(folder, infos, findings, has_own_info=folder == chosen.parent)
+        _check_folder(dataset, folder, infos, findings, has_own_info=folder == chosen.parent)
     return infos
-
-
-def centers_m(dataset: BopDataset, obj_ids: Iterable[int]) -> dict[int, Float[np.ndarray, "3"]]:
-    """Centre of each object, object frame, metres; its origin where the model is unusable, which is reported."""
-    centers = {}
-    for obj_id in obj_ids:
-        try:
-            centers[obj_id] = dataset.center_m(obj_id)
-        except PoseError:
-            centers[obj_id] = np.zeros(3)
-    return centers
 
 
 def _load_infos(file: Path, findings: Findings) -> dict[int, ModelInfo]:
@@ -79,7 +68,9 @@ def _load_infos(file: Path, findings: Findings) -> dict[int, ModelInfo]:
     return infos
 
 
-def _check_folder(folder: Path, infos: dict[int, ModelInfo], findings: Findings, *, has_own_info: bool) -> None:
+def _check_folder(
+    dataset: BopDataset, folder: Path, infos: dict[int, ModelInfo], findings: Findings, *, has_own_info: bool
+) -> None:
     for path in sorted(folder.glob("obj_*.ply")):
         number = path.stem.removeprefix("obj_")
         if not number.isdigit() or int(number) not in infos:
@@ -93,7 +84,7 @@ def _check_folder(folder: Path, infos: dict[int, ModelInfo], findings: Findings,
             findings.add(level, "model-missing", str(path), "models_info.json lists the object, found no file")
             continue
         try:
-            mesh = load_mesh(path, units="mm")
+            mesh = dataset.mesh_at(path)
         except MeshError as error:
             findings.add_error("model", error)
             continue

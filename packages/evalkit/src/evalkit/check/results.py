@@ -2,6 +2,7 @@
 
 import re
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -10,21 +11,20 @@ from posecore import se3
 from posecore.bop import BopDataset, ResultTable, read_sidecar
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import LineFault, parse_results
-from posecore.bop.results import metres_fault, read_result_bytes, unknown_ids
+from posecore.bop.results import POINT, Extent, metres_fault, read_result_bytes, unknown_ids
 from posecore.errors import PoseError, ResultFileError
 
 from evalkit.check.annotations import ROUGH_ROTATION
 from evalkit.check.findings import Findings
 from evalkit.check.images import off_image_px
-from evalkit.check.models import centers_m
 
 TIME_TOLERANCE_S = 1e-3
 """Largest difference between an image's times that bop_toolkit accepts."""
 _NAME = re.compile(r"[^_]+_(?P<dataset>[^_-]+)-(?P<split>[^_-]+)(-[^_-]+)?(_.+)?\.csv")
 
 
-def check_results(path: Path, dataset: BopDataset | None, findings: Findings) -> None:
-    """Check a result file, and where `dataset` is given also against it."""
+def check_results(path: Path, dataset: BopDataset | None, extents: Mapping[int, Extent], findings: Findings) -> None:
+    """Check a result file, and where `dataset` is given also against it; `extents` are of its usable models."""
     faults = 0
 
     def note(fault: LineFault) -> None:
@@ -39,7 +39,7 @@ def check_results(path: Path, dataset: BopDataset | None, findings: Findings) ->
         return
     findings.cover("result files")
     findings.cover("estimates", len(table))
-    metres = metres_fault(table)
+    metres = metres_fault(table, extents)
     if metres is not None:
         findings.add("error", "units", f"{path}:{metres.line}", metres.message, "metres?")
     try:
@@ -53,7 +53,7 @@ def check_results(path: Path, dataset: BopDataset | None, findings: Findings) ->
     _check_scores(path, table, findings)
     _check_rotations(path, table, findings)
     if dataset is not None:
-        _check_against(path, table, dataset, findings)
+        _check_against(path, table, dataset, extents, findings)
     _check_name(path, dataset, findings)
 
 
@@ -120,7 +120,9 @@ def _check_rotations(path: Path, table: ResultTable, findings: Findings) -> None
         findings.add("warning", "rough-rotation", f"{path}:{int(table.line[index])}", message, hint)
 
 
-def _check_against(path: Path, table: ResultTable, dataset: BopDataset, findings: Findings) -> None:
+def _check_against(
+    path: Path, table: ResultTable, dataset: BopDataset, extents: Mapping[int, Extent], findings: Findings
+) -> None:
     try:
         unknown = unknown_ids(table, dataset)
     except PoseError as error:  # the dataset's own fault, reported with it
@@ -130,7 +132,7 @@ def _check_against(path: Path, table: ResultTable, dataset: BopDataset, findings
         findings.add("error", f"line-{fault.field}", f"{path}:{fault.line}", fault.message)
     is_valid = ~np.isin(table.line, [fault.line for fault in unknown])
     _check_counts(path, table, dataset, findings)
-    _check_poses(path, table, is_valid, dataset, findings)
+    _check_poses(path, table, is_valid, dataset, extents, findings)
 
 
 def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings: Findings) -> None:
@@ -158,11 +160,15 @@ def _check_counts(path: Path, table: ResultTable, dataset: BopDataset, findings:
 
 
 def _check_poses(
-    path: Path, table: ResultTable, is_valid: Bool[np.ndarray, " n"], dataset: BopDataset, findings: Findings
+    path: Path,
+    table: ResultTable,
+    is_valid: Bool[np.ndarray, " n"],
+    dataset: BopDataset,
+    extents: Mapping[int, Extent],
+    findings: Findings,
 ) -> None:
     """Poses behind the camera or outside the image."""
-    centers = centers_m(dataset, dataset.models_info)
-    points_m = np.array([centers.get(obj_id, np.zeros(3)) for obj_id in table.obj_id.tolist()]).reshape(-1, 3)
+    points_m = np.array([extents.get(i, POINT).center_m for i in table.obj_id.tolist()]).reshape(-1, 3)
     T_cam_center = se3.with_origin_at(table.T_cam_obj, points_m)
     behind = is_valid & (T_cam_center[:, 2, 3] <= 0)
     for index in np.flatnonzero(behind).tolist():

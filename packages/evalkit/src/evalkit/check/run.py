@@ -4,12 +4,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from posecore.bop import BopDataset
+from posecore.bop.results import Extent, extents_of
 from posecore.errors import PoseError
 
 from evalkit.check.annotations import check_scenes
 from evalkit.check.findings import Findings
 from evalkit.check.images import check_images
-from evalkit.check.models import centers_m, check_models
+from evalkit.check.models import check_models
 from evalkit.check.results import check_results
 from evalkit.check.self_test import check_ground_truth
 from evalkit.check.targets import check_targets
@@ -46,23 +47,28 @@ def check(
     """
     findings = Findings(limit)
     opened: BopDataset | None = None
+    extents: dict[int, Extent] = {}
     try:
         opened = BopDataset(dataset, split, sensor)
     except PoseError as error:
         findings.add_error("dataset", error)
     if opened is not None:
-        _check_dataset(opened, samples, findings, on_stage)
+        extents = _check_dataset(opened, samples, findings, on_stage)
     for path in results:
         on_stage(str(path))
-        check_results(Path(path), opened if opened is not None and _has_models(opened) else None, findings)
+        usable = opened if opened is not None and _has_models(opened) else None
+        check_results(Path(path), usable, extents, findings)
     return findings
 
 
-def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, on_stage: Callable[[str], None]) -> None:
+def _check_dataset(
+    dataset: BopDataset, samples: int, findings: Findings, on_stage: Callable[[str], None]
+) -> dict[int, Extent]:
     on_stage("models")
     infos = check_models(dataset, findings)
+    extents = extents_of(dataset, infos)
     on_stage("annotations")
-    scenes = check_scenes(dataset, infos, centers_m(dataset, infos), findings)
+    scenes = check_scenes(dataset, infos, extents, findings)
     on_stage("images")
     chosen = check_images(dataset, scenes, infos, samples, findings)
     on_stage("targets")
@@ -70,6 +76,7 @@ def _check_dataset(dataset: BopDataset, samples: int, findings: Findings, on_sta
     if findings.ok:  # else the evaluation would report the same faults again
         on_stage("ground truth against itself")
         check_ground_truth(dataset, scenes, chosen, findings)
+    return extents
 
 
 def _has_models(dataset: BopDataset) -> bool:

@@ -60,6 +60,7 @@ def perturb(
       evalkit perturb --dataset lm --out curve.csv --protocol paper
     """
     from posecore.bop.perturbation import Level
+    from posecore.errors import ConfigError
 
     from evalkit.inputs.perturbation import PROTOCOLS, PerturbJob, write_initial_poses
 
@@ -77,7 +78,18 @@ def perturb(
         depth_stretch=depth_stretch,
         seed=seed,
     )
-    count = write_initial_poses(job)
+    try:
+        count = write_initial_poses(job)
+    except ConfigError as error:
+        raise ConfigError(_with_options(str(error))) from error
     click.echo(f"{count} initial poses: {out}")
     if protocol is not None:
         click.echo(f"Protocol '{protocol}' refines them in {PROTOCOLS[protocol].iterations} iterations.")
+
+
+def _with_options(message: str) -> str:
+    """An error of `perturb_dataset` with options for its parameters."""
+    options = {"depth_stretch": "--depth-stretch", "random_up_to.translation_diameter": "--random-translation"}
+    for parameter, option in options.items():
+        message = message.replace(parameter, option)
+    return message

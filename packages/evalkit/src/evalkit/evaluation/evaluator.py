@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from posecore.bop import BopDataset, Estimate, GroundTruth
 from posecore.camera import Camera
 from posecore.errors import RenderError
@@ -139,7 +140,8 @@ class Evaluator:
         while waiting or running:
             while waiting and len(running) <= self.workers:  # one more than run, so that none waits for its pairs
                 number, block = waiting.popitem()
-                running[self._pool.submit(_score_in_worker, block)] = number
+                centers_m = {obj_id: self.dataset.center_m(obj_id) for obj_id in {pair.gt.obj_id for pair in block}}
+                running[self._pool.submit(_score_in_worker, block, centers_m)] = number
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 try:
                     yield running.pop(future), future.result()
@@ -242,6 +244,7 @@ def _start_worker(root: Path, split: str, sensor: str | None, vss: VssKind, with
     _worker = Scorer(BopDataset(root, split, sensor), visible=vss == "visible", with_vsd=with_vsd)
 
 
-def _score_in_worker(block: Sequence[MatchedPose]) -> pd.DataFrame:
+def _score_in_worker(block: Sequence[MatchedPose], centers_m: Mapping[int, Float[np.ndarray, "3"]]) -> pd.DataFrame:
     assert _worker is not None
+    _worker.centers_m.update(centers_m)
     return _worker.score(block)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from posecore import se3
 from posecore.bop import BopDataset, Estimate, GroundTruth
-from posecore.bop.perturbation import Level, instances_of
+from posecore.bop.perturbation import Level
 from posecore.errors import ResultFileError
 
 from evalkit.inputs.result_files import ResultFile
@@ -49,7 +49,7 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
     by_key = _by_key(result.estimates)
     pairs: list[MatchedPose] = []
     for target in dataset.targets:
-        instances = instances_of(dataset, target)[: target.inst_count]  # in BOP the most visible ones
+        instances = dataset.instances(target)
         candidates = by_key.get((target.scene_id, target.im_id, target.obj_id), [])
         best = sorted(candidates, key=lambda estimate: -estimate.score)[: target.inst_count]
         matched: list[tuple[GroundTruth, Estimate | None]] = []
@@ -57,7 +57,7 @@ def _pair_targets(dataset: BopDataset, result: ResultFile) -> Pairing:
             free = [gt for gt in instances if all(gt is not other for other, _ in matched)]
             matched.append((_nearest(dataset, estimate, free), estimate))
         unmatched = [gt for gt in instances if all(gt is not other for other, _ in matched)]
-        matched += [(gt, None) for gt in unmatched[: max(0, min(target.inst_count, len(instances)) - len(matched))]]
+        matched += [(gt, None) for gt in unmatched]
         pairs += [
             MatchedPose(scene_id=target.scene_id, im_id=target.im_id, gt=gt, estimate=estimate)
             for gt, estimate in matched

@@ -74,6 +74,10 @@ class PerturbJob:
             raise ConfigError(
                 f"--protocol {self.protocol} brings its own levels; leave --angles and --translations away"
             )
+        if not (self.protocol or self.angles_deg or self.translations_diameter or self.random_up_to):
+            raise ConfigError(
+                "no levels: give --angles 5,10,15 or --translations 0.1,0.2 or --random-up-to 20 or --protocol paper"
+            )
         if self.depth_stretch != 1 and not (self.random_up_to and self.random_up_to.translation_diameter):
             raise ConfigError("--depth-stretch needs a random initial pose; give --random-translation too")
 

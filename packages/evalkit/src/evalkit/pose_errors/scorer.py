@@ -36,6 +36,9 @@ class Scorer:
         dataset: with ground truth.
         visible: VSS of visible parts instead of whole silhouettes, which needs depth images.
         with_vsd: whether VSD is added where an image has depth.
+
+    Attributes:
+        centers_m: centres of objects, object frame, metres, which full models are read for where they are missing.
     """
 
     def __init__(self, dataset: BopDataset, *, visible: bool, with_vsd: bool) -> None:
@@ -44,6 +47,7 @@ class Scorer:
         self.camera: Callable[[int, int], Camera] = lru_cache(KEPT_IMAGES)(dataset.camera)
         self.gt: Callable[[int, int], list[GroundTruth]] = lru_cache(KEPT_IMAGES)(dataset.gt)
         self._depth_m = lru_cache(1)(dataset.depth_m)  # pairs come image by image
+        self.centers_m: dict[int, Float[np.ndarray, "3"]] = {}
         self._models: dict[int, Model] = {}
         self._gt_patches: OrderedDict[tuple[int, int, int], Patch] = OrderedDict()
 
@@ -99,7 +103,9 @@ class Scorer:
             if obj_id not in self.dataset.models_info:
                 raise DatasetError(f"{self.dataset.root}: models_info.json has no object {obj_id}; add its diameter")
             mesh, info = self.dataset.mesh(obj_id, eval=True), self.dataset.models_info[obj_id]
-            model = Model(mesh=mesh, info=info, center_m=self.dataset.center_m(obj_id))
+            if obj_id not in self.centers_m:
+                self.centers_m[obj_id] = self.dataset.center_m(obj_id)
+            model = Model(mesh=mesh, info=info, center_m=self.centers_m[obj_id])
             self.rasteriser.add(obj_id, model.mesh)
             self._models[obj_id] = model
         return self._models[obj_id]

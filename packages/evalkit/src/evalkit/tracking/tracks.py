@@ -9,7 +9,6 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 from posecore import se3
 from posecore.bop import BopDataset, BopTarget, Estimate, GroundTruth
-from posecore.bop.perturbation import instances_of
 from posecore.errors import ResultFileError
 from posecore.symmetry import Symmetric
 from scipy.optimize import linear_sum_assignment
@@ -144,7 +143,7 @@ def frames_of(
     rows, T_est, T_gt = [], [], []
     for target in _every_pose(dataset) if all_frames else dataset.targets:
         key = (target.scene_id, target.im_id, target.obj_id)
-        instances = sorted(instances_of(dataset, target)[: target.inst_count], key=lambda gt: gt.gt_index)
+        instances = sorted(dataset.instances(target), key=lambda gt: gt.gt_index)
         best = sorted(estimates[key], key=lambda estimate: -estimate.score)[: len(instances)]
         matched = _matched(dataset, best, instances)
         for index, gt in enumerate(instances):

@@ -315,6 +315,22 @@ class BopDataset:
             for index, entry in enumerate(entries)
         ]
 
+    def instances(self, target: BopTarget) -> list[GroundTruth]:
+        """Annotated instances that a target asks for, with a pose: the most visible ones, in that order.
+
+        Raises:
+            DatasetError: there is none.
+        """
+        annotated = [gt for gt in self.gt(target.scene_id, target.im_id) if gt.obj_id == target.obj_id and gt.has_pose]
+        if not annotated:
+            raise DatasetError(
+                f"{self.scene_path(target.scene_id) / 'scene_gt.json'}: image {target.im_id} has no pose of object "
+                f"{target.obj_id}, which the targets ask for"
+            )
+        return sorted(annotated, key=lambda gt: -(1.0 if gt.visib_fract is None else gt.visib_fract))[
+            : target.inst_count
+        ]
+
     def _visibility(self, scene_id: int, im_id: int, count: int) -> list[float | None]:
         if not self._source.has(scene_id, "gt_info"):
             return [None] * count
@@ -364,7 +380,10 @@ class BopDataset:
 
     def mesh(self, obj_id: int, eval: bool = False) -> Mesh:
         """A model in metres; with `eval` the simplified one that BOP scores with, where there is one."""
-        path = self.mesh_path(obj_id, eval)
+        return self.mesh_at(self.mesh_path(obj_id, eval))
+
+    def mesh_at(self, path: Path) -> Mesh:
+        """A file of a models folder in metres, read once."""
         if path not in self._meshes:
             self._meshes[path] = load_mesh(path, units="mm")
         return self._meshes[path]

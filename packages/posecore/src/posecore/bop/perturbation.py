@@ -11,7 +11,7 @@ from jaxtyping import Float
 from posecore import se3
 from posecore.bop.dataset import BopDataset, BopTarget, GroundTruth
 from posecore.bop.results import Estimate, write_results
-from posecore.errors import ConfigError, DatasetError
+from posecore.errors import ConfigError
 
 INITIAL_METHOD = "initial"
 """`method` in the sidecar of a file of initial poses."""
@@ -23,22 +23,6 @@ class Level:
 
     angle_deg: float
     translation_diameter: float
-
-
-def instances_of(dataset: BopDataset, target: BopTarget) -> list[GroundTruth]:
-    """Annotated instances of a target with a pose, the most visible first.
-
-    Raises:
-        DatasetError: there is none.
-    """
-    instances = [gt for gt in dataset.gt(target.scene_id, target.im_id) if gt.obj_id == target.obj_id and gt.has_pose]
-    if not instances:
-        scene = dataset.scene_path(target.scene_id)
-        raise DatasetError(
-            f"{scene / 'scene_gt.json'}: image {target.im_id} has no pose of object {target.obj_id}, "
-            "which the targets ask for"
-        )
-    return sorted(instances, key=lambda gt: -(1.0 if gt.visib_fract is None else gt.visib_fract))
 
 
 def perturb_dataset(
@@ -73,15 +57,13 @@ def perturb_dataset(
         ConfigError: there are no levels, or an initial pose would lie behind the camera.
     """
     if not levels and random_up_to is None:
-        raise ConfigError(
-            "no levels: give --angles 5,10,15 or --translations 0.1,0.2 or --random-up-to 20 or --protocol paper"
-        )
+        raise ConfigError("levels and random_up_to: found neither, expected one at least")
     estimates: list[Estimate] = []
     rows: list[dict[str, Any]] = []
     for target in (target for target in dataset.targets if obj_ids is None or target.obj_id in obj_ids):
         diameter_m = dataset.models_info[target.obj_id].diameter_m
         center_m = dataset.center_m(target.obj_id)
-        for gt in instances_of(dataset, target)[: target.inst_count]:
+        for gt in dataset.instances(target):
             rng = np.random.default_rng([seed, target.scene_id, target.im_id, target.obj_id, gt.gt_index])
             drawn = [_drawn(random_up_to, rng)] if random_up_to else []
             for number, level in enumerate([*levels, *drawn]):
@@ -126,8 +108,8 @@ def _stretched(
     T = se3.stretched_along_ray(T_gt, initial, factor)
     if T[2, 3] <= 0:
         raise ConfigError(
-            f"--depth-stretch {factor:g}: puts object {target.obj_id} of image {target.im_id}, "
-            f"scene {target.scene_id}, behind the camera; lower it or --random-translation"
+            f"depth_stretch {factor:g}: puts object {target.obj_id} of image {target.im_id}, "
+            f"scene {target.scene_id}, behind the camera; lower it or random_up_to.translation_diameter"
         )
     distance_diameter = float(np.linalg.norm(T[:3, 3] - T_gt[:3, 3])) / diameter_m
     return T, replace(level, translation_diameter=distance_diameter)

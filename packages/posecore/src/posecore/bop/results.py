@@ -1,28 +1,33 @@
 """BOP result files: `scene_id,im_id,obj_id,score,R,t,time`, millimetres, one estimate a line, with a JSON sidecar."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from posecore import se3
 from posecore.bop.dataset import BopDataset
 from posecore.bop.jsonfile import as_list, read_json
 from posecore.bop.models_info import MM
 from posecore.bop.result_table import HEADER, LineFault, ResultTable, parse_results
-from posecore.errors import ResultFileError
+from posecore.errors import PoseError, ResultFileError
 from posecore.files import read_regular, write_atomic
 from posecore.renamed import migrated_keys
 
 __all__ = [
     "Estimate",
+    "Extent",
     "LineFault",
     "ResultTable",
     "estimate_table",
     "estimates_of",
+    "extents_of",
+    "in_metres",
     "metres_fault",
     "read_result_bytes",
     "read_result_table",
@@ -34,6 +39,10 @@ __all__ = [
 ]
 
 SUSPICIOUS_DISTANCE_MM = 10.0
+REACH_DIAMETERS = 0.6
+"""A nearer object reaches the camera."""
+NEAREST_MM = 1e-3 * SUSPICIOUS_DISTANCE_MM
+"""Least length that is suspected: in metres, a smaller one would be no nearer to any object."""
 RENAMED = {
     "start_lines": "initial_lines",
     "method=start": "method=initial",
@@ -97,11 +106,14 @@ def read_result_table(
 
     Raises:
         ResultFileError: missing or empty file, a line that breaks the format, NaN, a scaled or mirrored rotation, an
-            unknown id, translations that look like metres. The message names file and line.
+            unknown id, translations that look like metres (`in_metres`; without a dataset, by the origins alone). The
+            message names file and line.
     """
     file = Path(path)
     table = parse_results(read_result_bytes(file), str(file))
     metres = metres_fault(table)
+    if metres is not None and dataset is not None:  # only then, as centres are read from the meshes
+        metres = metres_fault(table, extents_of(dataset, np.unique(table.obj_id).tolist()))
     if metres is not None:
         raise ResultFileError(f"{file}:{metres.line}: {metres.message}")
     if dataset is not None:
@@ -148,19 +160,67 @@ def estimate_table(estimates: Sequence[Estimate]) -> ResultTable:
     )
 
 
-def metres_fault(table: ResultTable) -> LineFault | None:
-    """Fault if a file's translations are probably in metres, else None."""
-    if not len(table):
+class Extent(NamedTuple):
+    """Place and size of an object.
+
+    Attributes:
+        center_m: Centre in its frame, metres.
+        diameter_m: Diameter, metres.
+    """
+
+    center_m: Float[np.ndarray, "3"]
+    diameter_m: float
+
+
+POINT = Extent(np.zeros(3), 0.0)
+"""An object that is unknown."""
+
+
+def in_metres(T_cam_obj: Float[np.ndarray, "n 4 4"], extents: Sequence[Extent]) -> bool:
+    """Whether translations of BOP files are probably in metres: origins are at the camera, which is in the objects.
+
+    An origin alone may lie there, as that of a mesh scanned in the camera's frame.
+
+    Args:
+        T_cam_obj: Poses as read, metres.
+        extents: Of each pose's object; `POINT` where it is unknown.
+    """
+    if not len(T_cam_obj):
+        return False
+    centers_m = np.array([extent.center_m for extent in extents])
+    origin_mm, center_mm = (
+        np.linalg.norm(T[:, :3, 3], axis=1) / MM for T in (T_cam_obj, se3.with_origin_at(T_cam_obj, centers_m))
+    )
+    reach_mm = np.array([REACH_DIAMETERS * extent.diameter_m for extent in extents]) / MM
+    is_at_camera = NEAREST_MM <= float(np.median(origin_mm)) < SUSPICIOUS_DISTANCE_MM
+    return is_at_camera and float(np.median(center_mm / np.maximum(reach_mm, SUSPICIOUS_DISTANCE_MM))) < 1
+
+
+def metres_fault(table: ResultTable, extents: Mapping[int, Extent] | None = None) -> LineFault | None:
+    """Fault if a file's translations are probably in metres, else None.
+
+    Args:
+        table: Result file.
+        extents: Of the objects that are known.
+    """
+    by_id = extents or {}
+    if not in_metres(table.T_cam_obj, [by_id.get(obj_id, POINT) for obj_id in table.obj_id.tolist()]):
         return None
-    # The length, not t_z: an origin off the object may lie beside the camera.
     median_mm = float(np.median(np.linalg.norm(table.T_cam_obj[:, :3, 3], axis=1))) / MM
-    if median_mm >= SUSPICIOUS_DISTANCE_MM:
-        return None
     message = (
         f"the median length of t in the file is {median_mm:.4g}, probably in metres; "
         "BOP result files hold millimetres, multiply t by 1000"
     )
     return LineFault(line=int(table.line[0]), field="t", kind="metres", message=message)
+
+
+def extents_of(dataset: BopDataset, obj_ids: Iterable[int]) -> dict[int, Extent]:
+    """Extent of each object whose model is usable."""
+    extents = {}
+    for obj_id in obj_ids:
+        with suppress(PoseError):  # no such model, or a damaged one
+            extents[obj_id] = Extent(dataset.center_m(obj_id), dataset.mesh(obj_id).diameter_m)
+    return extents
 
 
 def unknown_ids(table: ResultTable, dataset: BopDataset, images: Literal["gt", "camera"] = "gt") -> list[LineFault]:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-import msgspec
 from msgspec import UNSET, Meta, Struct, UnsetType
 
 from posecore.errors import PoseError, ShardError
@@ -75,7 +74,7 @@ class MergedEntry(Struct):
     card: dict[str, Any]
 
     def __post_init__(self) -> None:
-        msgspec.convert(self.card, Card)
+        check_entries("card", {self.digest: self.card}, Card)
 
 
 class Card(Struct):

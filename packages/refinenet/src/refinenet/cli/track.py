@@ -119,7 +119,6 @@ def track(
     refinenet track clip.mp4 --camera camera.json --mesh part.ply --pose start.json --checkpoint best.safetensors \\
         --out track.csv --video annotated.mp4
     """
-    frames = _frames(source, dataset)
     settings = MethodSettings(
         method=method, checkpoint=checkpoint, iterations=iterations, device=device, allow_other_mesh=allow_other_mesh
     )
@@ -140,8 +139,8 @@ def track(
     from refinenet.tracking.run import TrackJob, track_to_file
 
     job = TrackJob(
-        method=settings, source=frames, out=out, init=init, pose=pose, split=split, scene=scene, camera=camera,
-        mesh_files=mesh_files, units=units, objects=objects, motion_model=motion_model,
+        method=settings, dataset=dataset, source=source, out=out, init=init, pose=pose, split=split, scene=scene,
+        camera=camera, mesh_files=mesh_files, units=units, objects=objects, motion_model=motion_model,
         tracking_threshold=tracking_threshold, accept_threshold=accept_threshold, patience=patience,
         depth_step=depth_step, video=video, fps=fps, name=name, threads=threads,
     )  # fmt: skip
@@ -156,21 +155,6 @@ def track(
     _print(job, summary)
     if summary.stopped is not None:
         end_early(summary.stopped, f"what was tracked is in {out}")
-
-
-def _frames(source: Path | None, dataset: Path | None) -> Path:
-    """The folder or file with the frames."""
-    from refinenet.tracking.frame_sources import is_bop_dataset
-
-    if source is None and dataset is not None:
-        if dataset.exists() and not is_bop_dataset(dataset):
-            raise click.UsageError(f"--dataset {dataset}: found no models folder in it, expected a BOP dataset")
-        return dataset
-    if source is None or dataset is not None:
-        raise click.UsageError("give SOURCE, a folder of images or a video file, or else --dataset DIR")
-    if is_bop_dataset(source):
-        raise click.UsageError(f"track {source} is now track --dataset {source}, since it is a BOP dataset")
-    return source
 
 
 def _print(job: "TrackJob", summary: "TrackSummary") -> None:

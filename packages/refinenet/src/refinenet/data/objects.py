@@ -20,7 +20,12 @@ from refinenet.geometry.symmetry import ObjectPoints
 
 
 def object_ids(reader: ShardReader) -> list[int]:
-    """Objects of the data card, sorted."""
+    """Objects of the data card, sorted.
+
+    Raises:
+        ShardError: The card has none.
+    """
+    reader.require("objects")
     return sorted(int(key) for key in reader.card["objects"])
 
 

@@ -171,16 +171,21 @@ def save_state(folder: Path, step: int, state: Mapping[str, Any]) -> None:
     """Write the optimiser's state of a step, for `load_state`."""
     buffer = io.BytesIO()
     torch.save(dict(state), buffer)
-    write_atomic(_state_path(folder, step), buffer.getvalue())
+    write_atomic(state_path(folder, step), buffer.getvalue())
 
 
-def load_state(folder: Path, step: int) -> dict[str, Any]:
+def load_state(folder: Path, step: int, *, ema: bool = False) -> dict[str, Any]:
     """The optimiser's state that belongs to `last.safetensors` of this step.
+
+    Args:
+        folder: Of the run.
+        step: Of the checkpoint.
+        ema: Whether the checkpoint's weights are the EMA, and those that training continues with are in the state.
 
     Raises:
         CheckpointError: It is missing or damaged; the message names the key.
     """
-    path = _state_path(folder, step)
+    path = state_path(folder, step)
     try:
         content = torch.load(io.BytesIO(read_regular(path)), map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
@@ -195,20 +200,21 @@ def load_state(folder: Path, step: int) -> dict[str, Any]:
         raise CheckpointError(
             f"{path}: damaged ({type(error).__name__}), so the run cannot be resumed; start a new one"
         ) from error
-    return checked_state(content, path)
+    return checked_state(content, path, ema=ema)
 
 
 def drop_leftovers(folder: Path, keep: int) -> None:
     """Remove the optimiser states of other steps, and temporary files of a killed run."""
     for path in folder.glob("optimiser-*.pt"):
-        if path != _state_path(folder, keep):
+        if path != state_path(folder, keep):
             path.unlink(missing_ok=True)
     for name in ("*.safetensors", "optimiser-*.pt"):
         for path in folder.glob(f".{name}.*.tmp"):
             path.unlink(missing_ok=True)
 
 
-def _state_path(folder: Path, step: int) -> Path:
+def state_path(folder: Path, step: int) -> Path:
+    """File of the optimiser's state of a step."""
     return folder / f"optimiser-{step:07d}.pt"
 
 

@@ -27,7 +27,7 @@ class _Metadata(Struct):
     step: _Digits
     dataset_sha256: Name
     objects: str
-    camera_fx_px: Annotated[str, Meta(pattern=r"^[0-9.]{1,32}(e[-+]?[0-9]{1,3})?\Z")]
+    camera_fx_px: Annotated[str, Meta(pattern=r"^[0-9]{1,20}(\.[0-9]{0,40})?(e[-+]?[0-9]{1,2})?\Z")]
 
 
 class _ObjectCard(Struct):
@@ -60,6 +60,10 @@ class _State(Struct):
     world: Annotated[int, Meta(ge=1, le=1 << 20)]
     validation_shards: list[_Id] = []
     weights: dict[str, Any] | None = None
+
+
+class _EmaState(_State, kw_only=True):
+    weights: dict[str, Any]
 
 
 class SplitRecord(Struct):
@@ -121,14 +125,14 @@ def _tensors(values: Mapping[Any, Any], prefix: str) -> Iterator[tuple[str, Tens
             yield from _tensors(value, f"{prefix}{key}.")
 
 
-def checked_state(content: Any, path: Path) -> dict[str, Any]:
-    """An optimiser state with today's keys.
+def checked_state(content: Any, path: Path, *, ema: bool) -> dict[str, Any]:
+    """An optimiser state with today's keys; beside an EMA with weights.
 
     Raises:
         CheckpointError: A key is missing or wrong, or a number is not finite; the message names it.
     """
     state = migrated_state(content) if isinstance(content, Mapping) else content
-    check(state, _State, str(path), CheckpointError, _STATE_ADVICE)
+    check(state, _EmaState if ema else _State, str(path), CheckpointError, _STATE_ADVICE)
     require_finite({key: state.get(key) or {} for key in ("optimiser", "weights")}, path)
     return dict(state)
 

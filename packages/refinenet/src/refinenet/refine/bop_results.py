@@ -42,6 +42,7 @@ class RefineJob:
         candidates: Result file for all poses that a global search scored.
         workers: Processes.
         threads: Torch threads; 0 leaves torch's choice, and 1 to each of several processes.
+        run: Training run that these poses are the result of, for the sidecar.
 
     Raises:
         ConfigError: The method has no candidates.
@@ -59,6 +60,7 @@ class RefineJob:
     candidates: Path | None = None
     workers: int = 1
     threads: int = 0
+    run: Path | None = None
 
     def __post_init__(self) -> None:
         if self.candidates is not None and self.method.method not in WITH_NETWORK:
@@ -240,6 +242,8 @@ def _sidecar(
     }
     if loaded is not None:
         sidecar |= {"checkpoint": loaded.path.name, "checkpoint_sha256": loaded.sha256}
+    if job.run is not None:
+        sidecar["run"] = str(job.run.resolve())
     failures = {pose.initial.line: pose.result.failure or "" for pose in refined.failed}
     sidecar |= {
         "settings": {"refinenet": __version__, **method.settings},

@@ -160,37 +160,50 @@ def _refuse_depth(method: PoseRefiner, source: Path) -> None:
         raise DatasetError(f"{source}: images and videos have no depth, which {method.name} needs; give a BOP dataset")
 
 
-def is_bop_dataset(path: Path) -> bool:
-    """Whether a path is taken for a BOP dataset: a folder with a models folder."""
-    return path.is_dir() and any(path.glob("models*"))
+def open_scene(dataset: Path, *, split: str | None, scene: int | None, camera: Path | None) -> BopScene:
+    """A scene of a BOP dataset.
+
+    Args:
+        dataset: Folder.
+        split: Split.
+        scene: Scene; optional where there is only one.
+        camera: None; those of images and videos are refused.
+
+    Raises:
+        DatasetError: There is no such folder, or it holds no scene.
+        ConfigError: It is no BOP dataset, the scene is ambiguous, or an option is for the other kind of source.
+    """
+    _require_existing(dataset)
+    if not _is_bop_dataset(dataset):
+        raise ConfigError(f"--dataset {dataset}: found no models folder in it, expected a BOP dataset")
+    if camera is not None:
+        raise ConfigError("--camera is for images and videos; a BOP dataset brings its own cameras")
+    opened = BopDataset(dataset, split)
+    if scene is None and len(opened.scene_ids) > 1:
+        some = ", ".join(map(str, opened.scene_ids[:10]))
+        raise ConfigError(f"{dataset}: has {len(opened.scene_ids)} scenes ({some}); choose one with --scene")
+    sequence = BopScene(dataset=opened, scene_id=opened.scene_ids[0] if scene is None else scene)
+    opened.scene_path(sequence.scene_id)
+    return sequence
 
 
-def open_sequence(source: Path, *, split: str | None, scene: int | None, camera: Path | None) -> FrameSequence:
-    """The sequence at a path: a BOP dataset where it has a models folder, else a folder of images or a video file.
+def open_images(source: Path, *, split: str | None, scene: int | None, camera: Path | None) -> ImageFolder | VideoFile:
+    """The images of a folder, or of a video file.
 
     Args:
         source: Folder or file.
-        split: Split of a BOP dataset.
-        scene: Scene of a BOP dataset; optional where there is only one.
-        camera: BOP `camera.json`, for images and videos.
+        split: None; that of a BOP dataset is refused.
+        scene: Scene in the result file.
+        camera: BOP `camera.json`.
 
     Raises:
         DatasetError: There is no such path, or it holds no frames.
-        ConfigError: The scene is ambiguous, a camera is missing, or an option is for the other kind of source.
+        ConfigError: A camera is missing, the folder is a BOP dataset, or an option is for one.
         CameraError: The file holds no camera.
     """
-    if not source.exists():
-        raise DatasetError(f"{source}: no such folder or file; give a BOP dataset, a folder of images or a video")
-    if is_bop_dataset(source):
-        if camera is not None:
-            raise ConfigError("--camera is for images and videos; a BOP dataset brings its own cameras")
-        dataset = BopDataset(source, split)
-        if scene is None and len(dataset.scene_ids) > 1:
-            some = ", ".join(map(str, dataset.scene_ids[:10]))
-            raise ConfigError(f"{source}: has {len(dataset.scene_ids)} scenes ({some}); choose one with --scene")
-        sequence = BopScene(dataset=dataset, scene_id=dataset.scene_ids[0] if scene is None else scene)
-        dataset.scene_path(sequence.scene_id)
-        return sequence
+    _require_existing(source)
+    if _is_bop_dataset(source):
+        raise ConfigError(f"track {source} is now track --dataset {source}, since it is a BOP dataset")
     if split is not None:
         raise ConfigError(f"--split is for BOP datasets; {source} has no models folder, so it is none")
     if camera is None:
@@ -199,6 +212,16 @@ def open_sequence(source: Path, *, split: str | None, scene: int | None, camera:
     if source.is_dir():
         return ImageFolder(folder=source, camera=file_camera, scene_id=scene or 0)
     return VideoFile(file=source, camera=file_camera, scene_id=scene or 0)
+
+
+def _require_existing(path: Path) -> None:
+    if not path.exists():
+        raise DatasetError(f"{path}: no such folder or file; give a BOP dataset, a folder of images or a video")
+
+
+def _is_bop_dataset(path: Path) -> bool:
+    """Whether a folder has one of models, `models` or `models_eval`, as BOP datasets do."""
+    return any(folder.is_dir() for name in ("models", "models_*") for folder in path.glob(name))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

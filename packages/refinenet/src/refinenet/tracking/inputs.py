@@ -5,15 +5,23 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from posecore.bop import ModelInfo, read_results
+from posecore.bop import Estimate, ModelInfo
 from posecore.bop.annotations import ground_truth
 from posecore.bop.jsonfile import id_of, read_json
 from posecore.bop.models_info import load_model_info
-from posecore.errors import ConfigError
+from posecore.bop.result_table import parse_results
+from posecore.bop.results import (
+    Extent,
+    estimate_table,
+    estimates_of,
+    in_metres,
+    metres_fault,
+    read_result_bytes,
+)
+from posecore.errors import ConfigError, ResultFileError
 from posecore.mesh import Mesh, Units, load_mesh
 
 from refinenet.models.checkpoint import Checkpoint
-from refinenet.refiner import SUSPICIOUS_M
 from refinenet.tracking.frame_sources import BopScene, FrameSequence
 
 Pose = Float[np.ndarray, "4 4"]
@@ -40,9 +48,11 @@ class InitialPoses:
     ) -> None:
         self._always: dict[int, list[Pose]] = {}
         self._at: dict[int, dict[int, list[Pose]]] = {}
+        self._file, self._estimates = init or pose, list[Estimate]()
         if init is not None:
-            for initial in read_results(init):
+            for initial in estimates_of(parse_results(read_result_bytes(init), str(init))):
                 if initial.scene_id == sequence.scene_id and (not objects or initial.obj_id in objects):
+                    self._estimates.append(initial)
                     self._at.setdefault(initial.im_id, {}).setdefault(initial.obj_id, []).append(initial.T_cam_obj)
         elif pose is not None:
             for obj_id, T in read_poses(pose):
@@ -60,21 +70,31 @@ class InitialPoses:
         """Initial poses for a frame, by object id."""
         return self._at.get(number, {}) if self._at else self._always
 
+    def require_millimetres(self, meshes: Mapping[int, Mesh]) -> None:
+        """Refuse poses whose file is probably in metres, see `posecore.bop.results.in_metres`.
+
+        Args:
+            meshes: By object id, of all objects.
+
+        Raises:
+            ResultFileError: The result file is.
+            ConfigError: A pose of the pose file is.
+        """
+        extents = {obj_id: Extent(mesh.center_m, mesh.diameter_m) for obj_id, mesh in meshes.items()}
+        metres = metres_fault(estimate_table(self._estimates), extents)
+        if metres is not None:
+            raise ResultFileError(f"{self._file}:{metres.line}: {metres.message}")
+        for obj_id, T in ((obj_id, T) for obj_id, poses in self._always.items() for T in poses):
+            if in_metres(T[None], [extents[obj_id]]):
+                raise ConfigError(
+                    f"{self._file}: a t of length {1e3 * np.linalg.norm(T[:3, 3]):.4g} is probably in metres; "
+                    "cam_t_m2c is in millimetres, multiply it by 1000"
+                )
+
 
 def read_poses(file: Path) -> list[tuple[int, Pose]]:
-    """Object ids and poses (metres) of a list of `scene_gt.json`, which is in millimetres.
-
-    Raises:
-        ConfigError: The translations are in metres.
-    """
+    """Object ids and poses (metres) of a list of `scene_gt.json`, which is in millimetres."""
     poses = [ground_truth(entry, i, None, f"{file}, entry {i}") for i, entry in enumerate(read_json(file, list))]
-    # The length, not t_z: an origin off the object may lie beside the camera.
-    nearest_m = min((float(np.linalg.norm(pose.T_cam_obj[:3, 3])) for pose in poses), default=SUSPICIOUS_M)
-    if nearest_m < SUSPICIOUS_M:
-        raise ConfigError(
-            f"{file}: a t of length {1e3 * nearest_m:.4g} is probably in metres; "
-            "cam_t_m2c is in millimetres, multiply it by 1000"
-        )
     return [(pose.obj_id, pose.T_cam_obj) for pose in poses]
 
 

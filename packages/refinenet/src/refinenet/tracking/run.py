@@ -21,7 +21,7 @@ from refinenet.models.checkpoint import Checkpoint
 from refinenet.refine.overlay import Overlay
 from refinenet.refine.registry import WITH_CONFIDENCE, WITH_NETWORK, MethodSettings, make_refiner
 from refinenet.refiner import PoseRefiner
-from refinenet.tracking.frame_sources import BopScene, FrameSequence, open_sequence
+from refinenet.tracking.frame_sources import BopScene, FrameSequence, open_images, open_scene
 from refinenet.tracking.inputs import InitialPoses, load_models
 from refinenet.tracking.state import TrackingConfig, TrackState
 from refinenet.tracking.tracker import Tracked, Tracker, default_config
@@ -34,7 +34,8 @@ class TrackJob:
 
     Attributes:
         method: Method and settings.
-        source: BOP dataset, folder of images, or video file.
+        dataset: BOP dataset with the images; None with `source`.
+        source: Folder of images, or video file; None with `dataset`.
         out: Poses, a BOP result file; its sidecar lies beside it.
         init: BOP result file with initial poses at their images; None with `pose`.
         pose: List of `scene_gt.json` with initial poses for any image; None with `init`.
@@ -55,12 +56,13 @@ class TrackJob:
         threads: Torch threads; 0 leaves torch's choice.
 
     Raises:
-        ConfigError: Not exactly one source of initial poses, or a setting has no effect for the method.
+        ConfigError: Not exactly one source of images or of initial poses, or a setting has no effect for the method.
     """
 
     method: MethodSettings
-    source: Path
     out: Path
+    dataset: Path | None = None
+    source: Path | None = None
     init: Path | None = None
     pose: Path | None = None
     split: str | None = None
@@ -83,6 +85,8 @@ class TrackJob:
         method = self.method.method
         if method in WITH_NETWORK and self.method.checkpoint is not None:
             raise ConfigError(f"--method {method} takes no --checkpoint")
+        if (self.dataset is None) == (self.source is None):
+            raise ConfigError("give SOURCE, a folder of images or a video file, or else --dataset DIR")
         if (self.init is None) == (self.pose is None):
             raise ConfigError("give either --init or --pose: the initial poses of the objects")
         for name in ("tracking_threshold", "accept_threshold", "depth_step"):
@@ -166,9 +170,13 @@ def track_to_file(
     if job.threads:
         torch.set_num_threads(job.threads)
     loaded = None if job.method.checkpoint is None else checkpoints.load(job.method.checkpoint)
-    sequence = open_sequence(job.source, split=job.split, scene=job.scene, camera=job.camera)
+    if job.dataset is not None:
+        sequence: FrameSequence = open_scene(job.dataset, split=job.split, scene=job.scene, camera=job.camera)
+    elif job.source is not None:
+        sequence = open_images(job.source, split=job.split, scene=job.scene, camera=job.camera)
     initial_poses = InitialPoses(sequence, job.init, job.pose, job.objects)
     meshes, infos = load_models(sequence, job.mesh_files, job.units, loaded, initial_poses.obj_ids)
+    initial_poses.require_millimetres(meshes)
     for path in filter(None, (job.out, job.video)):
         require_writable(path)
     log, stopped, total = TrackLog(), None, len(sequence) or None
@@ -268,7 +276,7 @@ def _sidecar(
             "patience_frames": config.patience,
             "depth_step": config.depth_step,
         },
-        "init": (job.init or job.pose or job.source).name,
+        "init": next(file.name for file in (job.init, job.pose) if file is not None),
         "states": {str(state): count for state, count in log.states.items()},
         "resets": log.resets,
         "misses": log.misses,

@@ -65,7 +65,7 @@ class ObjectTrack:
         obj_id: Object.
         config: Thresholds.
         center_m: Centre of the object, in its own frame.
-        symmetries: Symmetries of the object; None without.
+        symmetries: Symmetries of the object, in its own frame; None without.
         motion_model: Whether the next pose is predicted at constant velocity, instead of equal to the last.
         status: State.
     """
@@ -112,7 +112,8 @@ class ObjectTrack:
             )
         pose = result.T_cam_obj
         if self._observations and self.symmetries is not None:
-            pose = nearest_symmetric(pose, self._observations[-1].T_cam_obj, self.symmetries)
+            last = se3.with_origin_at(self._observations[-1].T_cam_obj, -self.center_m)
+            pose = nearest_symmetric(pose, last, self.symmetries)
         restarted = best >= self._continued
         # Across a gap there is no velocity: the motion in between is unknown.
         continues = bool(self._observations) and not restarted and not gap

@@ -21,12 +21,16 @@ class SavedRun:
     """A run on disk.
 
     Attributes:
+        config: Configuration to continue with: the requested one, and the pivot of the run.
         last: Its newest checkpoint.
         state: Optimiser state of the same step.
+        state_path: Its file.
     """
 
+    config: TrainConfig
     last: checkpoint.Checkpoint
     state: dict[str, Any]
+    state_path: Path
 
     @property
     def validation_shards(self) -> list[int]:
@@ -52,10 +56,11 @@ def load_run(config: TrainConfig, out: Path) -> SavedRun:
             "%s: steps was %d and is now %d, so the cosine rate jumps from %.3g to %.3g",
             last.path, before.steps, config.steps, *rates,
         )  # fmt: skip
-    state = checkpoint.load_state(out, last.provenance.step)
+    state = checkpoint.load_state(out, last.provenance.step, ema=config.optimiser.ema_decay > 0)
     if config.loader.follow and "validation_shards" not in state:
         raise CheckpointError(f"{out}: a run with --follow of an earlier version, which held out less; start a new run")
-    return SavedRun(last=last, state=state)
+    path = checkpoint.state_path(out, last.provenance.step)
+    return SavedRun(config=config, last=last, state=state, state_path=path)
 
 
 def restore(run: Trainer, saved: SavedRun) -> None:
@@ -76,11 +81,13 @@ def restore(run: Trainer, saved: SavedRun) -> None:
             f"{last.path}: was trained by {state['world']} processes and now there are {run.ranks.world}; resume with "
             f"torchrun --nproc-per-node {state['world']}"
         )
-    trained = last if run.ema is None else replace(last, tensors=state.get("weights") or {})
-    trained.give_weights(run.network, run.config.network)
-    if run.ema is not None:
+    if run.ema is None:
+        last.give_weights(run.network, run.config.network)
+    else:
+        trained = replace(last, tensors=state["weights"], path=saved.state_path)
+        trained.give_weights(run.network, run.config.network)
         last.give_weights(run.ema.network, run.config.network)
-    run.optimiser.load_state_dict(own_optimiser_state(run.optimiser, state["optimiser"], last.path))
+    run.optimiser.load_state_dict(own_optimiser_state(run.optimiser, state["optimiser"], saved.state_path))
     run.step = last.provenance.step
     if last.provenance.config.validation.pairs == run.config.validation.pairs:  # other pairs have other errors
         run.best_mm = float(state["best_mm"])

@@ -1,6 +1,6 @@
 """Assembly of a training run from its configuration."""
 
-from dataclasses import replace
+import logging
 from pathlib import Path
 
 import torch
@@ -16,6 +16,8 @@ from refinenet.training.ranks import Ranks
 from refinenet.training.resume import load_run, restore
 from refinenet.training.run import Trainer
 from refinenet.training.training_data import open_data
+
+log = logging.getLogger(__name__)
 
 
 def open_run(config: TrainConfig, url: str, out: Path, *, resume: bool = False) -> Trainer:
@@ -39,7 +41,7 @@ def open_run(config: TrainConfig, url: str, out: Path, *, resume: bool = False) 
     ranks, device = Ranks.of_environment(), choose_device(config.device)
     saved = load_run(config, out) if resume else None
     if saved is not None:
-        config = replace(config, pivot=saved.last.provenance.config.pivot)
+        config = saved.config
     joined = saved.validation_shards if saved else ()
     data = open_data(config, url, out, ranks, resume=resume, validation_shards=joined)
     network = build_network(config, device, pretrained=saved is None)
@@ -75,7 +77,14 @@ def build_network(config: TrainConfig, device: torch.device, *, pretrained: bool
     """
     network: nn.Module = make_network(config.network).to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
     if pretrained and config.init:
-        checkpoint.load(Path(config.init)).give_weights(network, config.network)
+        loaded = checkpoint.load(Path(config.init))
+        loaded.give_weights(network, config.network)
+        if (before := loaded.provenance.config.pivot) != config.pivot:
+            log.warning(
+                "%s: its updates are about the %s of meshes, and this run's about the %s: where these lie apart, it "
+                "has to learn them anew; --set pivot=%s keeps them",
+                config.init, before, config.pivot, before,
+            )  # fmt: skip
     elif pretrained and isinstance(network, PaperNet) and config.network.backbone.pretrained:
         stem = config.network.backbone
         inception.load_pretrained(network.stem, stem.name, stem.weights)
