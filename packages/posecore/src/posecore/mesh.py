@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from posecore.diameter import diameter
 from posecore.errors import MeshError
 from posecore.files import write_atomic
-from posecore.mesh_files import GREY, METRE_SUFFIXES, TIMES_COLOURS, mesh_bytes, read_surface
+from posecore.mesh_files import GREY, METRE_SUFFIXES, MIP_LEVELS, TIMES_COLOURS, mesh_bytes, read_surface
 from posecore.mesh_files.creases import split_creases
 from posecore.mesh_files.part import display_from_linear, linear_from_display, to_bytes
 
@@ -60,6 +60,7 @@ class Mesh:
         vertex_rgb: (v, 3) display (sRGB) colours, or None.
         uv: (v, 2) texture coordinates, origin at the texture's bottom left, or None.
         texture_rgb: (h, w, 3) display colours, row 0 at the top, or None.
+        mip_levels: How often the texture may be halved before materials that share it mix; None: ever.
         has_normals: Whether the normals are the file's. Others are smooth, and hard edges come with `drawn`.
         path: Source file.
         sha256: Hash of that file's bytes; empty where the coordinates are not the file's.
@@ -73,6 +74,7 @@ class Mesh:
     vertex_rgb: UInt8[np.ndarray, "v 3"] | None = None
     uv: Float[np.ndarray, "v 2"] | None = None
     texture_rgb: UInt8[np.ndarray, "h w 3"] | None = None
+    mip_levels: int | None = None
     has_normals: bool = True
     path: str = ""
     sha256: str = ""
@@ -266,6 +268,7 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
         vertex_rgb=surface.rgb,
         uv=surface.uv,
         texture_rgb=surface.texture_rgb,
+        mip_levels=surface.mip_levels,
         has_normals=surface.has_normals,
         path=str(file),
         sha256=hashlib.sha256(data).hexdigest(),
@@ -300,7 +303,8 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
 
     A texture goes as a PNG of the same name beside it, named in the PLY as BOP's models do (`comment TextureFile`,
     texture_u, texture_v); the vertex colours are then the texture sampled at the vertices, for readers that take no
-    textures. A mesh with a texture and vertex colours keeps these, and a comment that they are a factor.
+    textures. A mesh with a texture and vertex colours keeps these, and a comment that they are a factor; limited mip
+    levels have a comment too.
     """
     columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     if mesh.has_normals:
@@ -322,6 +326,7 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
         vertices["texture_u"], vertices["texture_v"] = mesh.uv[:, 0], mesh.uv[:, 1]
         texture = Path(path).with_suffix(".png")
         comment = f"comment TextureFile {texture.name}\n" + ("" if mesh.vertex_rgb is None else f"{TIMES_COLOURS}\n")
+        comment += "" if mesh.mip_levels is None else f"{MIP_LEVELS} {mesh.mip_levels}\n"
         _, data = cv2.imencode(".png", mesh.texture_rgb[..., ::-1])
         write_atomic(texture, data.tobytes())  # before the PLY, which names it
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", (3,))])

@@ -19,10 +19,12 @@ class Texture:
     Attributes:
         rgb: (h, w, 3) display colours, row 0 at the top.
         wrap: What follows beyond texture coordinates of [0, 1], along u and along v.
+        mip_levels: How often it may be halved before materials that share it mix; None: ever.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    mip_levels: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

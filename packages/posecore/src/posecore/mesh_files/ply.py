@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 TIMES_COLOURS = "comment TextureTimesVertexColours"
 """Header line of a PLY whose vertex colours are a factor on its texture; elsewhere a texture stands for them."""
+MIP_LEVELS = "comment TextureMipLevels"
+"""Header line of a PLY with the number of halvings after which materials would mix in its texture."""
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("texture_s", "texture_t"))
 _BINARY = {
@@ -255,6 +257,7 @@ def _colours(file: Path, table: Any) -> UInt8[np.ndarray, "n 3"] | None:
 
 def _textures(file: Path, header: list[str], allow_missing_textures: bool) -> list[Texture]:
     textures = []
+    levels = [int(word) for line in header if line.startswith(MIP_LEVELS) and (word := line.split()[-1]).isdecimal()]
     for line in header:
         if not line.lower().startswith("comment texturefile"):
             continue
@@ -263,7 +266,8 @@ def _textures(file: Path, header: list[str], allow_missing_textures: bool) -> li
         try:
             if path is None:
                 raise missing(file, "texture", file.parent, name)
-            textures.append(Texture(rgb=decode(file, str(path), linked_bytes(file, path)).rgb))
+            picture = decode(file, str(path), linked_bytes(file, path))
+            textures.append(Texture(rgb=picture.rgb, mip_levels=min(levels, default=None)))
         except MeshError:
             if not allow_missing_textures:
                 raise

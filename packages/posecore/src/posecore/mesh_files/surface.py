@@ -23,6 +23,7 @@ class Surface:
     rgb: UInt8[np.ndarray, "v 3"] | None
     uv: Float[np.ndarray, "v 2"] | None
     texture_rgb: UInt8[np.ndarray, "h w 3"] | None
+    mip_levels: int | None
     has_normals: bool
 
 
@@ -63,6 +64,7 @@ def joined(file: Path, parts: list[MeshPart]) -> Surface:
         rgb=rgb,
         uv=None if uv is None else uv.astype(np.float32),
         texture_rgb=None if texture is None else texture.rgb,
+        mip_levels=None if texture is None else texture.mip_levels,
         has_normals=has_normals,
     )
 
