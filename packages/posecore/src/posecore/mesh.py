@@ -19,7 +19,7 @@ from posecore.errors import MeshError
 from posecore.files import write_atomic
 from posecore.mesh_files import GREY, METRE_SUFFIXES, MIP_LEVELS, TIMES_COLOURS, mesh_bytes, read_surface
 from posecore.mesh_files.creases import split_creases
-from posecore.mesh_files.part import display_from_linear, linear_from_display, to_bytes
+from posecore.srgb import display_from_linear, linear_from_display, to_bytes
 
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}

@@ -160,14 +160,7 @@ def _compact(part: MeshPart) -> MeshPart:
     rows = np.column_stack([part.faces.reshape(-1), np.repeat(shifts, 3, axis=0)])
     unique, inverse = np.unique(rows, axis=0, return_inverse=True)
     of_vertex = unique[:, 0].astype(np.int64)
-    return replace(
-        part,
-        vertices=part.vertices[of_vertex],
-        faces=inverse.reshape(-1, 3),
-        normals=None if part.normals is None else part.normals[of_vertex],
-        rgb=None if part.rgb is None else part.rgb[of_vertex],
-        uv=part.uv[of_vertex] - unique[:, 1:],
-    )
+    return part.picked(of_vertex, inverse.reshape(-1, 3), part.uv[of_vertex] - unique[:, 1:])
 
 
 def _window(parts: list[MeshPart]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
