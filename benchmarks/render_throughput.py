@@ -39,6 +39,7 @@ from synthgen.inputs.assets import Assets
 from synthgen.inputs.sources import Sources
 from synthgen.pairs import data_card
 from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
+from synthgen.run.render import RenderJob, shard_job
 
 Fields = dict[str, Any]
 Environment = dict[str, str]
@@ -242,7 +243,10 @@ def measure(arguments: argparse.Namespace, hypotheses: int | None, before: Envir
     overrides = [*arguments.overrides, *([] if hypotheses is None else [f"hypotheses_per_scene={hypotheses}"])]
     config = load_config(arguments.preset, overrides, {"engine": arguments.engine})
     sources = Sources(objects=(arguments.object,), occluders=arguments.occluders)
-    meshes, assets = sources.meshes(), sources.assets()
+    loaded = shard_job(
+        RenderJob(out="", n=arguments.pairs, config=config, sources=sources)
+    )  # as the command draws them
+    meshes, assets = dict(loaded.meshes), loaded.assets
     command = [sys.executable, "-m", "synthgen.cli", "render", "--object", str(arguments.object)]
     command += [] if arguments.occluders is None else ["--occluders", str(arguments.occluders)]
     command += ["--engine", arguments.engine, "--preset", arguments.preset]

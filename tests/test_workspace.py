@@ -40,8 +40,8 @@ WANTED_UNSEEN = {  # declared though no line imports them
 TEST_TIME_ORACLES = {"timm"}
 ORDER = {  # folders and top-level modules of a package in the order of its work: none imports one that comes later
     "posecore": (
-        "errors text schema renamed se3 files image_file config processes numba_jit kernels ply mesh_files symmetry "
-        "diameter mesh detail simplify window camera contour raster store shard bop html command_line"
+        "errors text schema renamed se3 srgb files image_file config processes numba_jit kernels ply mesh_files "
+        "symmetry diameter mesh detail simplify window camera contour raster store shard bop html command_line"
     ),
     "synthgen": "names scene engine machine lock config image inputs engines draw pairs bop run inspect verify cli",
     "refinenet": (

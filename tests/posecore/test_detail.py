@@ -250,3 +250,72 @@ def test_of_vertices_at_one_position_the_first_that_fits_best_is_taken():
         members = np.arange(positions._begin[p], positions._begin[p + 1])
         fit = np.einsum("mi,i->m", mesh.normals[positions._members[members]], n)
         assert index == members[np.flatnonzero(fit >= fit.max() - 1e-12)[0]]
+
+
+def box_with_needles() -> Mesh:
+    """A box of 100 mm, finely cut and rotated, float32 millimetres, without normals; needles lie along its edges.
+
+    Every second triangle's longest edge has a further vertex in its middle, which a needle joins to it.
+    """
+    box = trimesh.creation.box((100.0, 60.0, 40.0))
+    for _ in range(5):
+        box = box.subdivide()
+    vertices, faces = np.asarray(box.vertices) @ se3.rotation_from_rotvec(np.array([0.3, 0.5, 0.2])).T, box.faces
+    split, rest = faces[::2], faces[1::2]
+    middle = len(vertices) + np.arange(len(split))
+    a, b, c = split.T
+    parts = [rest, np.stack([a, middle, c], 1), np.stack([middle, b, c], 1), np.stack([a, b, middle], 1)]
+    vertices = np.concatenate([vertices, (vertices[a] + vertices[b]) / 2]) + np.array([31.0, -7.0, 12.0])
+    faces = np.concatenate(parts)
+    return Mesh(
+        vertices_m=vertices.astype(np.float32).astype(np.float64) / 1e3,
+        faces=faces.astype(np.int32),
+        normals=np.asarray(trimesh.Trimesh(vertices, faces, process=False).vertex_normals, np.float32),
+        vertex_rgb=np.random.default_rng(0).integers(0, 255, (len(vertices), 3)).astype(np.uint8),
+        has_normals=False,
+    )
+
+
+def test_levels_of_copies_are_the_copied_levels() -> None:
+    """Needles have an area or none by rounding, and what is drawn of a copy is that of the original nevertheless."""
+    mesh = with_levels(box_with_needles())
+    own = mesh.level(1)
+    shift_m = np.array([0.7, -1.3, 0.11])
+    for copy, vertices_m in (
+        (mesh.with_origin_at(shift_m), own.vertices_m - shift_m),
+        (mesh.scaled(0.731), (own.vertices_m - mesh.center_m) * 0.731),
+        (mesh.recoloured((1, 2, 3)).with_origin_at(shift_m), own.vertices_m - shift_m),
+    ):
+        less = copy.level(1)
+        np.testing.assert_allclose(less.vertices_m, vertices_m, atol=1e-12)
+        np.testing.assert_array_equal(less.faces, own.faces)
+        np.testing.assert_array_equal(less.normals, own.normals)
+        np.testing.assert_array_equal(copy.drawn.faces, mesh.drawn.faces)
+        assert copy.sha256 == ""
+    np.testing.assert_array_equal(mesh.scaled(2.0).level(1).colours, own.colours)
+    assert (mesh.recoloured((1, 2, 3)).level(1).colours == [1, 2, 3]).all()
+
+
+def test_needles_leave_hard_edges_hard() -> None:
+    drawn = box_with_needles().drawn
+    corners = drawn.vertices_m[drawn.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    is_face = area > 1e-3 * area.max()
+    assert is_face.mean() < 0.8
+    cosines = np.einsum("fki,fi->fk", drawn.normals[drawn.faces], normals / np.maximum(area, 1e-30)[:, None])[is_face]
+    assert cosines.min() > 0.999
+
+
+def test_vertices_without_a_face_do_not_move_the_levels(ball: Mesh) -> None:
+    plain = replace(ball, levels=())
+    far = {
+        "vertices_m": np.vstack([plain.vertices_m, [[9.0, 9.0, 9.0]]]),
+        "normals": np.vstack([plain.normals, [[0.0, 0.0, 1.0]]]).astype(np.float32),
+        "vertex_rgb": np.vstack([plain.vertex_rgb, [[0, 0, 0]]]).astype(np.uint8),
+    }
+    other = replace(plain, **far)
+    other.__dict__["diameter_m"] = ball.diameter_m
+    less = with_levels(other).level(2)
+    np.testing.assert_allclose(less.vertices_m, ball.level(2).vertices_m, atol=1e-12)
+    np.testing.assert_array_equal(less.colours, ball.level(2).colours)

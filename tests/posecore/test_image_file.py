@@ -48,6 +48,30 @@ def test_a_picture_that_is_cut_off_is_refused(tmp_path, extension, capfd):
     assert capfd.readouterr().err == ""
 
 
+@pytest.mark.parametrize("extension", ["png", "jpg"])
+def test_what_follows_a_picture_is_not_its_matter(tmp_path, extension, capfd):
+    """Phones append a video to a photograph; a header of more than 64 KiB holds what editors write there."""
+    data, file = encoded(extension), tmp_path / f"a.{extension}"
+    expected = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    video = np.random.default_rng(4).integers(0, 200, 20_000).astype(np.uint8).tobytes()
+    note = b"\xff\xff\xe5" + struct.pack(">H", 40_000) + b"\xff\xd9" * 19_999
+    several = [data + video, data + b"\0" * 9_000]
+    if extension == "jpg":
+        several += [data[:2] + 2 * note + data[2:], data[:2] + 2 * note + data[2:] + video]
+    for whole in several:
+        file.write_bytes(whole)
+        assert picture_fault(file) is None
+        assert np.array_equal(read_picture(file), expected)
+        if not whole.endswith(video):
+            continue
+        for rest in (b"", video):
+            file.write_bytes(whole[: len(whole) - len(video) - 40] + rest)
+            assert picture_fault(file) == "is cut off"
+            with pytest.raises(DatasetError, match="cut off"):
+                read_picture(file)
+    assert capfd.readouterr().err == ""
+
+
 def test_a_picture_of_absurd_size_is_refused_before_it_is_decoded(tmp_path):
     (tmp_path / "bomb.png").write_bytes(bomb())
     with pytest.raises(DatasetError, match=r"bomb\.png: its header gives 100000 x 100000 pixels"):

@@ -1,6 +1,7 @@
 """Pools of processes that end at once when something goes wrong."""
 
 import os
+import signal
 import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
@@ -52,6 +53,43 @@ with spawned(2, behave_as_worker, (), "died") as pool:
 def test_nor_for_the_rest_of_a_result_that_is_being_sent(seconds):
     ended = run([sys.executable, "-c", ENDS.format(seconds)])
     assert (ended.returncode, ended.stderr) == (3, "")
+
+
+STOPPED = """
+import os, signal, sys
+from multiprocessing import resource_tracker, util
+from posecore.processes import behave_as_worker, spawned
+
+def interrupt(number, frame):
+    raise KeyboardInterrupt
+
+signal.signal(signal.SIGINT, interrupt)
+signal.signal(signal.SIGTERM, interrupt)
+module, name, turn, number = {"tracker": resource_tracker, "util": util}[sys.argv[1]], *sys.argv[2:]
+inner, calls = getattr(module, name), []
+
+def then_stopped(*arguments):
+    result = inner(*arguments)
+    calls.append(result)
+    if len(calls) == int(turn):
+        os.kill(os.getpid(), int(number))
+    return result
+
+setattr(module, name, then_stopped)
+try:
+    with spawned(2, behave_as_worker, (), "died"):
+        print("went on")
+except KeyboardInterrupt:
+    raise SystemExit(130)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(("module", "name", "turn"), [("tracker", "register", 1), ("util", "spawnv_passfds", 2)])
+def test_a_signal_while_a_pool_starts_leaves_nothing_and_is_not_lost(module, name, turn, number):
+    """After a semaphore is registered, and after the first process is launched, which is the second launch."""
+    ended = run([sys.executable, "-c", STOPPED, module, name, turn, int(number)])
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "")
 
 
 def test_a_process_that_dies_is_reported():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from posecore import se3
+from posecore.detail import with_levels
 from posecore.mesh import Mesh
 from posecore.raster import Rasteriser
 from posecore.simplify import simplified
@@ -72,3 +73,9 @@ def test_a_mesh_and_its_copy_with_another_origin_are_simplified_alike(dense):
     np.testing.assert_allclose(other.vertices_m - shift_m, plain.vertices_m, rtol=0, atol=1e-15)
     np.testing.assert_array_equal(other.faces, plain.faces)
     np.testing.assert_array_equal(other.vertex_rgb, plain.vertex_rgb)
+
+
+def test_a_simplified_mesh_has_no_levels_of_the_original(dense):
+    mesh = with_levels(dense)
+    assert mesh.levels
+    assert simplified(mesh, 500).levels == ()

@@ -7,6 +7,7 @@ import pytest
 from mesh_cases import BLUE, CASES, GREY, RED, MeshCase, obj, ply, write_files
 from posecore.camera import intrinsics
 from posecore.mesh import Mesh, load_mesh, mesh_digest, save_ply
+from posecore.mesh_files import atlas
 from posecore.raster import Rasteriser, Shading
 
 FLAT = Shading(ambient=1.0, diffuse=0.0)
@@ -35,6 +36,32 @@ def test_a_copy_as_ply_shows_the_same_and_has_the_same_digest(tmp_path: Path, na
     copy = load_mesh(tmp_path / "copy.ply")
     assert mesh_digest(copy) == mesh_digest(mesh)
     np.testing.assert_array_equal(middles(copy), middles(mesh))
+    assert copy.mip_levels == mesh.mip_levels
+
+
+@pytest.mark.parametrize("name", ["obj two textures", "obj plain", "obj plain with vt"])
+def test_materials_do_not_mix_where_the_object_is_small(tmp_path: Path, name: str) -> None:
+    """Eight pixels wide: a pixel of the picture is 16 of a texture wide."""
+    mesh = load_mesh(CASES[name].write(tmp_path))
+    assert mesh.mip_levels == 2
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[2, 3] = 0.8
+    with Rasteriser({1: mesh}) as raster:
+        drawn = raster.render(1, intrinsics(80, 80, 8, 8), T[None], 16, 16, shading=FLAT)
+    rows, columns = np.nonzero(drawn.mask[0])
+    assert (columns.min(), columns.max(), len(rows)) == (4, 11, 32)
+    expected = np.where(columns[:, None] < 8, CASES[name].left, CASES[name].right)
+    np.testing.assert_allclose(drawn.rgb[0][rows, columns].astype(int), expected, atol=2)
+
+
+def test_a_large_atlas_has_narrow_margins_before_textures_lose_pixels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = CASES["obj two textures"].write(tmp_path)
+    monkeypatch.setattr(atlas, "LARGEST_ATLAS_PX", 2 * (64 + 2 * 4))
+    mesh = load_mesh(file)
+    assert mesh.mip_levels == 1
+    assert mesh.texture_rgb is not None and sorted(mesh.texture_rgb.shape) == [3, 72, 144]
 
 
 def test_a_tiling_keeps_its_pattern_beside_other_textures(tmp_path: Path) -> None:
@@ -54,6 +81,7 @@ def test_a_single_texture_stays_as_it_is(tmp_path: Path) -> None:
     mesh = load_mesh(case(tmp_path))
     assert mesh.texture_rgb is not None and mesh.texture_rgb.shape == (64, 64, 3)
     assert mesh.uv is not None and mesh.uv.max() == 5
+    assert mesh.mip_levels is None
     assert mesh.vertex_rgb is None
 
 

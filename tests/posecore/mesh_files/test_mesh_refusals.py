@@ -1,5 +1,6 @@
 """Mesh files that cannot be drawn as they are described: refused in one line that names the reason."""
 
+import io
 import json
 import zlib
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 from mesh_cases import CASES, UV, Gltf, coloured, gltf, obj, plain, png, textured
+from PIL import Image
 from posecore.errors import MeshError, TextureError
 from posecore.mesh import load_mesh
 
@@ -55,6 +57,13 @@ def instanced(made: Gltf) -> None:
     made.square(node={"extensions": {"EXT_mesh_gpu_instancing": {"attributes": {}}}})
 
 
+def odd_dds() -> bytes:
+    """A DDS picture whose pixels are of no format: Pillow raises NotImplementedError."""
+    stream = io.BytesIO()
+    Image.new("RGB", (8, 8)).save(stream, "DDS")
+    return stream.getvalue()[:80] + bytes(4) + stream.getvalue()[84:]
+
+
 def large(made: Gltf) -> None:
     head = bytearray(plain((1, 2, 3)))
     head[16:24] = (60000).to_bytes(4, "big") * 2
@@ -69,6 +78,7 @@ REFUSED = {
     "texture empty": (obj("map_Kd a.png", files={"a.png": b""}), r"its texture \S*a\.png is empty \(0 bytes\)"),
     "texture cut": (obj("map_Kd a.png", files={"a.png": plain((9, 9, 9))[:-30]}), "its texture cannot be decoded"),
     "texture is text": (obj("map_Kd a.png", files={"a.png": b"hello"}), r"its texture \S*a\.png is not an image"),
+    "texture odd": (obj("map_Kd a.dds", files={"a.dds": odd_dds()}), r"its texture \S*a\.dds is not an image"),
     "texture is a pointer": (
         obj("map_Kd a.png", files={"a.png": b"version https://git-lfs.github.com/spec/v1\noid"}),
         r"a\.png is a Git LFS pointer, not the file itself; run git lfs pull",
@@ -111,6 +121,7 @@ REFUSED = {
     "glTF without uv": (gltf(without_uv), "has no TEXCOORD_0"),
     "glTF texture missing": (gltf(textured("gone%20too.png")), r"its texture \S*gone too\.png is missing"),
     "glTF texture cut": (gltf(textured(plain((9, 9, 9))[:-30])), "its texture cannot be decoded: image 1"),
+    "glTF texture odd": (gltf(textured(odd_dds())), "its texture image 1 is not an image"),
     "glTF texture empty": (gltf(textured("a.png"), files={"a.png": b""}), r"its texture \S*a\.png is empty"),
     "glTF texture too large": (gltf(large), "its texture image 1 is too large"),
 }

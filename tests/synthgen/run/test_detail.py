@@ -11,11 +11,15 @@ from posecore.detail import with_levels
 from posecore.mesh import Mesh, load_mesh, save_ply
 from posecore.raster import Rasteriser, rasteriser
 from posecore.shard import BIT_OBJECT, BIT_VISIBLE, ShardReader
+from posecore.shard.layout import TEST_SET
+from synthgen.bop.frame_maker import FramePlan
 from synthgen.draw.target import make_targets
 from synthgen.inputs.assets import Assets
 from synthgen.inputs.sources import Sources
 from synthgen.pairs.pair_maker import PairMaker
-from synthgen.run.render import RenderJob, render_dataset
+from synthgen.run.bop import BopJob, render_bop_dataset
+from synthgen.run.render import RenderJob, render_dataset, shard_job
+from synthgen.run.test_set import images_config, render_test_set
 from synthgen.verify.verify import verify
 
 CONTOUR_PX = 80  # of an object in a patch of 48 px, about
@@ -88,6 +92,22 @@ def test_labels_with_and_without_levels_agree(dense: Path, config_of, monkeypatc
         assert np.abs(full["scene_distance_px"] - less["scene_distance_px"]).mean() < 0.1
         assert np.abs(full["hypothesis_rgb"].astype(int) - less["hypothesis_rgb"]).mean() < 2
         assert np.abs(full["scene_rgb"].astype(int) - less["scene_rgb"]).mean() < 3
+
+
+@pytest.mark.slow
+def test_test_images_show_every_face_as_synthgen_bop_does(dense: Path, config_of, tmp_path: Path) -> None:
+    config, sources = config_of("occluders.front=[1,2]"), Sources(objects=(dense,), occluders=dense)
+    shards = shard_job(RenderJob(out=str(tmp_path), n=8, config=config, sources=sources))
+    assert shards.meshes[1].levels
+    assert shards.assets.occluders[0].levels
+    render_test_set(str(tmp_path), 2, shards, sources, workers=1)
+    job = BopJob(out=str(tmp_path / "bop"), plan=FramePlan(frames=2), config=images_config(config, 1), sources=sources)
+    render_bop_dataset(job)
+    assert contents(tmp_path / TEST_SET) == contents(tmp_path / "bop")
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_an_object_that_is_an_occluder_too_is_loaded_once(dense: Path) -> None:

@@ -6,13 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from posecore.bop import BopDataset
-from posecore.errors import ConfigError, DatasetError
+from posecore.errors import ConfigError, DatasetError, RenderError
 from synthgen.bop.frame_maker import FramePlan
 from synthgen.config import load_config
 from synthgen.inputs.sources import Sources
+from synthgen.run import dispatcher
 from synthgen.run.bop import BopJob, render_bop_dataset
 from synthgen.run.render import RenderJob, render_dataset
-from synthgen.run.test_set import SEED_DISTANCE, default_count, images_config
+from synthgen.run.test_set import SEED_DISTANCE, default_count, has_images, image_workers, images_config
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,46 @@ def test_a_recipe_for_many_objects_a_frame_suits_a_single_one():
     assert images_config(pbr, 2).frames.objects == (5, 10)
     assert images_config(pbr, 2).seed == pbr.seed + SEED_DISTANCE
     assert images_config(replace(pbr, seed=2**63 - 1), 2).seed == SEED_DISTANCE
+
+
+@pytest.mark.parametrize(
+    ("engine", "workers", "has_gpu", "processes"),
+    [("raster", 1, False, 1), ("raster", 4, False, 4), ("raster", 4, True, 1), ("cycles", 1, False, 2),
+     ("cycles", 4, False, 4), ("cycles", 4, True, 2)],
+)  # fmt: skip
+def test_a_blender_engine_has_processes_of_its_own_and_a_gpu_few(engine, workers, has_gpu, processes):
+    assert image_workers(load_config("default", [f"engine={engine}"]), workers, has_gpu=has_gpu) == processes
+
+
+@pytest.mark.slow
+def test_finished_images_stay_where_the_pairs_fail(config_of, tug_ply, tmp_path, monkeypatch):
+    def fail(*arguments, **settings):
+        raise ConfigError("no pairs")
+
+    out, sources = tmp_path / "shards", Sources(objects=(tug_ply,))
+    job = RenderJob(out=str(out), n=4, config=config_of(), sources=sources, workers=1, test_images=1)
+    monkeypatch.setattr(dispatcher, "run", fail)
+    for _ in range(2):  # the second time they are there
+        with pytest.raises(ConfigError, match="no pairs"):
+            render_dataset(job)
+        assert has_images(out, whole=True)
+
+
+@pytest.mark.parametrize(("error", "stays"), [(RenderError, True), (ConfigError, False)])
+def test_some_images_stay_unless_another_setting_is_needed(config_of, tug_ply, tmp_path, monkeypatch, error, stays):
+    def fail(folder, *arguments, **settings):
+        (folder / "test/000001").mkdir(parents=True)
+        (folder / "test/000001/scene_gt.json").write_text("{}")
+        raise error("no more images")
+
+    monkeypatch.setattr("synthgen.run.test_set.write_dataset", fail)
+    out = tmp_path / "shards"
+    job = RenderJob(
+        out=str(out), n=4, config=config_of(), sources=Sources(objects=(tug_ply,)), workers=1, test_images=3
+    )
+    with pytest.raises(error, match="no more images"):
+        render_dataset(job)
+    assert out.exists() == stays
 
 
 def contents(folder):

@@ -1,6 +1,5 @@
 """Levels of detail: the same mesh with fewer faces, each with the error that this makes."""
 
-from dataclasses import replace
 from typing import Any
 
 import fast_simplification  # type: ignore[import-untyped]
@@ -60,17 +59,21 @@ def with_levels(mesh: Mesh) -> Mesh:
                 is_closed=encloses_volume(points, faces),
             )
         )
-    return replace(mesh, levels=tuple(levels))
+    return mesh.with_levels(tuple(levels))
 
 
 class _Positions:
-    """Vertices of a mesh about its box centre, float32 millimetres; those at one position are one point."""
+    """Vertices of a mesh about its `center_m`, float32 millimetres; those at one position are one point.
+
+    Vertices that no face uses are left out.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         stored_mm = (mesh.vertices_m / METRES_PER_UNIT["mm"]).astype(np.float32).astype(np.float64)
-        order = np.lexsort(stored_mm.T)
+        used = np.unique(mesh.faces)
+        order = used[np.lexsort(stored_mm[used].T)]
         is_first = np.concatenate([[True], (np.diff(stored_mm[order], axis=0) != 0).any(axis=1)])
-        point = np.empty(len(order), np.int64)
+        point = np.zeros(len(stored_mm), np.int64)
         point[order] = np.cumsum(is_first) - 1
         self._members = order  # vertices by point
         self._begin = np.append(np.flatnonzero(is_first), len(order))
@@ -94,7 +97,7 @@ class _Positions:
         normals = np.cross(edges[:, 0], edges[:, 1])
         source = self._members[self._fitting(nearest.reshape(-1), np.repeat(normals, 3, axis=0))].reshape(faces.shape)
         pairs = np.stack([faces, source], axis=-1).reshape(-1, 2)
-        _, first, corner = np.unique(pairs @ [len(self._members), 1], return_index=True, return_inverse=True)
+        _, first, corner = np.unique(pairs @ [len(self._normals), 1], return_index=True, return_inverse=True)
         return pairs[first], corner.reshape(-1, 3)
 
     def _fitting(self, point: Int[np.ndarray, " c"], normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:

@@ -1,6 +1,7 @@
 """Decoding of picture files: size limits, truncated files, and the file's name in each error.
 
-Photographs, textures and panoramas come through here, and `posecore.bop.images` reads BOP's images with it.
+Photographs, Radiance panoramas and, by `posecore.bop.images`, BOP's images come through here. Textures of meshes have
+`posecore.mesh_files.images`, OpenEXR panoramas `synthgen.image.hdri`.
 """
 
 import io
@@ -8,6 +9,8 @@ import re
 import struct
 import warnings
 import zlib
+from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -24,6 +27,7 @@ HEAD_BYTES = 1 << 16
 """Bytes from the start that hold the header of a PNG or JPEG."""
 _TAIL_BYTES = 1 << 12
 _PNG, _JPEG, _JPEG_END = b"\x89PNG\r\n\x1a\n", b"\xff\xd8", b"\xff\xd9"
+_JPEG_SCAN = 0xDA
 _PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 _RADIANCE_SIZE = re.compile(rb"\n[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 
@@ -70,7 +74,10 @@ def read_picture(
 
 
 def picture_fault(path: str | Path) -> str | None:
-    """Reason why a file is no whole picture, from its first and last bytes; None if nothing is found there."""
+    """Reason why a file is no whole picture; None if nothing is found.
+
+    First and last bytes of a PNG or JPEG decide where its header and its end are in them.
+    """
     try:
         with open_regular(path) as stream:
             head = stream.read(HEAD_BYTES)
@@ -78,15 +85,18 @@ def picture_fault(path: str | Path) -> str | None:
             stream.seek(max(0, length - _TAIL_BYTES))
             tail = stream.read()
             end = next((end for start, end in ((_PNG, _PNG_END), (_JPEG, _JPEG_END)) if head.startswith(start)), b"")
-            stream.seek(0)
-            size = stated_size(head) if end else _size_by_pillow(stream.read())
+            size, is_whole = stated_size(head), end in tail
+            if size is None or not is_whole:
+                stream.seek(0)
+                data = stream.read()
+                size, is_whole = stated_size(data) or _size_by_pillow(data), _is_whole(data)
     except OSError as error:
         return str(error.strerror)
     if size is None:
         return "is not an image"
     if not 0 < size[0] * size[1] <= LARGEST_IMAGE_PX:
         return f"its header gives {size[0]} x {size[1]} pixels"
-    return None if end in tail else "is cut off"
+    return None if is_whole else "is cut off"
 
 
 def require_size(size: tuple[int, int] | None, name: str, error: type[PoseError] = DatasetError) -> None:
@@ -112,15 +122,25 @@ def stated_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Walk the segments up to the frame header; None if there is none."""
-    position = 2
-    while position + 9 < len(data) and data[position] == 0xFF:
-        marker, length = data[position + 1], struct.unpack(">H", data[position + 2 : position + 4])[0]
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+    """Width and height of the frame header; None if there is none."""
+    for position in _jpeg_segments(data):
+        if 0xC0 <= data[position + 1] <= 0xCF and data[position + 1] not in (0xC4, 0xC8, 0xCC):
             height, width = struct.unpack(">HH", data[position + 5 : position + 9])
             return int(width), int(height)
-        position += 2 + length
     return None
+
+
+def _jpeg_segments(data: bytes) -> Iterator[int]:
+    """Positions of the segments before the pixels; the last is that of the pixels, where the file has them."""
+    position = 2
+    while position + 9 < len(data) and data[position] == 0xFF:
+        if data[position + 1] == 0xFF:  # a fill byte
+            position += 1
+            continue
+        yield position
+        if data[position + 1] == _JPEG_SCAN:
+            return
+        position += 2 + int(struct.unpack(">H", data[position + 2 : position + 4])[0])
 
 
 def _size_by_pillow(data: bytes) -> tuple[int, int] | None:
@@ -140,7 +160,7 @@ def _size_by_pillow(data: bytes) -> tuple[int, int] | None:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Whether a PNG or JPEG is complete.
+    """Whether a PNG or JPEG is complete; other data may follow, as phones append videos.
 
     OpenCV fills the rest of a truncated JPEG with grey and prints libpng's warnings about a PNG. Pillow's `verify`
     accepts truncated JPEGs and takes 80 to 150 us more for each file.
@@ -148,7 +168,8 @@ def _is_whole(data: bytes) -> bool:
     if data.startswith(_PNG):
         return _whole_png(data)
     if data.startswith(_JPEG):
-        return _JPEG_END in data[-_TAIL_BYTES:]
+        pixels = deque(_jpeg_segments(data), maxlen=1)  # no pixel has these bytes; a thumbnail before them may
+        return bool(pixels) and data.find(_JPEG_END, pixels[0]) >= 0
     return True
 
 

@@ -1,6 +1,7 @@
 """Triangle meshes with vertex colours or a texture, in metres."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,9 +17,9 @@ from scipy.sparse.csgraph import connected_components
 from posecore.diameter import diameter
 from posecore.errors import MeshError
 from posecore.files import write_atomic
-from posecore.mesh_files import GREY, METRE_SUFFIXES, TIMES_COLOURS, mesh_bytes, read_surface
+from posecore.mesh_files import GREY, METRE_SUFFIXES, MIP_LEVELS, TIMES_COLOURS, mesh_bytes, read_surface
 from posecore.mesh_files.creases import split_creases
-from posecore.mesh_files.part import display_from_linear, linear_from_display, to_bytes
+from posecore.srgb import display_from_linear, linear_from_display, to_bytes
 
 Units = Literal["mm", "cm", "m"]
 METRES_PER_UNIT: dict[str, float] = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -59,9 +60,10 @@ class Mesh:
         vertex_rgb: (v, 3) display (sRGB) colours, or None.
         uv: (v, 2) texture coordinates, origin at the texture's bottom left, or None.
         texture_rgb: (h, w, 3) display colours, row 0 at the top, or None.
+        mip_levels: How often the texture may be halved before materials that share it mix; None: ever.
         has_normals: Whether the normals are the file's. Others are smooth, and hard edges come with `drawn`.
         path: Source file.
-        sha256: Hash of that file's bytes.
+        sha256: Hash of that file's bytes; empty where the coordinates are not the file's.
         levels: Levels of detail, finer ones first, that the rasteriser draws where they suffice; none unless they were
             made (`posecore.detail.with_levels`). They serve copies that are shifted, scaled or of other colours too.
     """
@@ -72,6 +74,7 @@ class Mesh:
     vertex_rgb: UInt8[np.ndarray, "v 3"] | None = None
     uv: Float[np.ndarray, "v 2"] | None = None
     texture_rgb: UInt8[np.ndarray, "h w 3"] | None = None
+    mip_levels: int | None = None
     has_normals: bool = True
     path: str = ""
     sha256: str = ""
@@ -98,14 +101,48 @@ class Mesh:
         return np.asarray(T_cam_obj[..., :3, :3] @ self.center_m + T_cam_obj[..., :3, 3])
 
     def with_origin_at(self, point_m: Float[np.ndarray, "3"]) -> "Mesh":
-        """The mesh in the frame with the same axes and its origin at a point; `se3.with_origin_at` converts poses.
+        """The mesh in the frame with the same axes and its origin at a point; `se3.with_origin_at` converts poses."""
+        return self._copied(
+            lambda mesh: replace(mesh, vertices_m=mesh.vertices_m - point_m, sha256=""), "diameter_m", "is_closed"
+        )
 
-        It is not the file's mesh any more, so it has no hash.
+    def scaled(self, factor: float) -> "Mesh":
+        """The mesh about its box centre, scaled by a positive factor."""
+        center_m = self.center_m
+        _ = self.is_closed  # at any scale; computed here, where positions within a nanometre count as one
+        return self._copied(
+            lambda mesh: replace(mesh, vertices_m=(mesh.vertices_m - center_m) * factor, sha256=""), "is_closed"
+        )
+
+    def recoloured(self, rgb: tuple[int, int, int]) -> "Mesh":
+        """The mesh in one display colour."""
+
+        def change(mesh: Mesh) -> Mesh:
+            vertex_rgb = np.tile(np.array(rgb, np.uint8), (len(mesh.vertices_m), 1))
+            return replace(mesh, vertex_rgb=vertex_rgb, uv=None, texture_rgb=None)
+
+        return self._copied(change, "diameter_m", "center_m", "is_closed")
+
+    def with_levels(self, levels: tuple[DetailLevel, ...]) -> "Mesh":
+        """The mesh with these levels of detail, which were made from its `drawn`."""
+        return self._copied(lambda mesh: replace(mesh, levels=levels), "diameter_m", "center_m", "is_closed")
+
+    def _copied(self, change: "Callable[[Mesh], Mesh]", *unchanged: str) -> "Mesh":
+        """A changed copy whose `drawn` is changed alike.
+
+        Splitting the copy's edges anew would number the vertices of `drawn` differently where rounding turns a needle
+        into a face, and levels of detail index them.
+
+        Args:
+            change: What makes the copy, the same for the mesh and for `drawn`: the number of vertices stays.
+            unchanged: Cached properties that the change leaves as they are.
         """
-        copy = replace(self, vertices_m=self.vertices_m - point_m, sha256="")
-        for name in ("diameter_m", "is_closed"):
+        copy = change(self)
+        for name in unchanged:
             if name in self.__dict__:
                 copy.__dict__[name] = self.__dict__[name]
+        if not self.has_normals:
+            copy.__dict__["drawn"] = copy if self.drawn is self else change(self.drawn)
         return copy
 
     def level(self, number: int) -> "Mesh":
@@ -120,21 +157,6 @@ class Mesh:
             normals=drawn.normals[level.sources],
             vertex_rgb=drawn.colours[level.sources],
         )
-
-    def scaled(self, factor: float) -> "Mesh":
-        """The mesh about its box centre, scaled. It keeps its hash."""
-        copy = replace(self, vertices_m=(self.vertices_m - self.center_m) * factor)
-        copy.__dict__["is_closed"] = self.is_closed
-        return copy
-
-    def recoloured(self, rgb: tuple[int, int, int]) -> "Mesh":
-        """The mesh in one display colour."""
-        vertex_rgb = np.tile(np.array(rgb, np.uint8), (len(self.vertices_m), 1))
-        copy = replace(self, vertex_rgb=vertex_rgb, uv=None, texture_rgb=None)
-        for name in ("diameter_m", "center_m", "is_closed"):
-            if name in self.__dict__:
-                copy.__dict__[name] = self.__dict__[name]
-        return copy
 
     @cached_property
     def colours(self) -> UInt8[np.ndarray, "v 3"]:
@@ -161,13 +183,14 @@ class Mesh:
         split = None if self.has_normals else split_creases(self.vertices_m, self.faces)
         if split is None:
             return self
-        rows, faces = split
+        rows, faces, is_needle = split
         vertices_m = self.vertices_m[rows]
+        surface = trimesh.Trimesh(vertices_m, faces[~is_needle], process=False)  # needles' normals are rounding
         return replace(
             self,
             vertices_m=vertices_m,
             faces=faces.astype(np.int32),
-            normals=_unit(trimesh.Trimesh(vertices_m, faces, process=False).vertex_normals),
+            normals=_unit(surface.vertex_normals),
             vertex_rgb=None if self.vertex_rgb is None else self.vertex_rgb[rows],
             uv=None if self.uv is None else self.uv[rows],
             has_normals=True,
@@ -245,6 +268,7 @@ def load_mesh(path: str | Path, *, units: Units = "mm", allow_missing_textures: 
         vertex_rgb=surface.rgb,
         uv=surface.uv,
         texture_rgb=surface.texture_rgb,
+        mip_levels=surface.mip_levels,
         has_normals=surface.has_normals,
         path=str(file),
         sha256=hashlib.sha256(data).hexdigest(),
@@ -279,7 +303,8 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
 
     A texture goes as a PNG of the same name beside it, named in the PLY as BOP's models do (`comment TextureFile`,
     texture_u, texture_v); the vertex colours are then the texture sampled at the vertices, for readers that take no
-    textures. A mesh with a texture and vertex colours keeps these, and a comment that they are a factor.
+    textures. A mesh with a texture and vertex colours keeps these, and a comment that they are a factor; limited mip
+    levels have a comment too.
     """
     columns = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     if mesh.has_normals:
@@ -301,6 +326,7 @@ def save_ply(mesh: Mesh, path: str | Path, *, units: Units = "mm") -> None:
         vertices["texture_u"], vertices["texture_v"] = mesh.uv[:, 0], mesh.uv[:, 1]
         texture = Path(path).with_suffix(".png")
         comment = f"comment TextureFile {texture.name}\n" + ("" if mesh.vertex_rgb is None else f"{TIMES_COLOURS}\n")
+        comment += "" if mesh.mip_levels is None else f"{MIP_LEVELS} {mesh.mip_levels}\n"
         _, data = cv2.imencode(".png", mesh.texture_rgb[..., ::-1])
         write_atomic(texture, data.tobytes())  # before the PLY, which names it
     faces = np.empty(len(mesh.faces), [("count", "u1"), ("index", "<i4", (3,))])

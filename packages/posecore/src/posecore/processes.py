@@ -12,6 +12,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import chain, islice
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from posecore.errors import RenderError
@@ -34,6 +35,31 @@ def interrupts_ignored() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupts_deferred() -> Iterator[None]:
+    """Put Ctrl-C and a termination signal off until the block is done, and start processes that wait with Ctrl-C too.
+
+    An interruption between a semaphore and its registration would leave it behind, one while a process starts would
+    have it print a traceback, and one in a clean-up would leave the rest undone.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda number, frame: received.append(number)) for number in numbers}
+    try:
+        resource_tracker.ensure_running()  # its start would clear the mask
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # processes inherit it
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if received:
+            signal.raise_signal(received[0])
 
 
 def die_with_parent() -> None:
@@ -72,21 +98,24 @@ def spawned(
     """
     spawn = multiprocessing.get_context("spawn")
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(workers, mp_context=spawn, initializer=start, initargs=arguments) as pool:
+    with interrupts_deferred():
+        pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=start, initargs=arguments)
+    with pool:
         try:
-            with interrupts_ignored():
+            with interrupts_deferred():
                 for _ in range(workers):
                     pool.submit(os.getpid)  # starts one
             yield pool
         except BrokenProcessPool as error:
             raise RenderError(died) from error
         except BaseException:
-            results: Any = pool._result_queue  # nothing public ends a task that runs
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in set(multiprocessing.active_children()) - others:
-                process.kill()
-                process.join()
-            results._writer.close()  # else the pool would wait for the rest of a result that a process was writing
+            with interrupts_deferred():
+                results: Any = pool._result_queue  # nothing public ends a task that runs
+                pool.shutdown(wait=False, cancel_futures=True)
+                for process in set(multiprocessing.active_children()) - others:
+                    process.kill()
+                    process.join()
+                results._writer.close()  # else the pool would wait for the rest of a result that a process was writing
             raise
 
 

@@ -44,4 +44,5 @@ def simplified(mesh: Mesh, max_faces: int) -> Mesh:
         vertex_rgb=None if mesh.vertex_rgb is None else mesh.vertex_rgb[nearest],
         uv=None,
         sha256="",
+        levels=(),
     )

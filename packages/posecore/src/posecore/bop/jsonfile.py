@@ -28,10 +28,10 @@ def read_json(path: str | Path, kind: type = dict) -> Any:
         data = read_regular(file)
     except OSError as error:
         raise DatasetError(f"{file}: cannot be read ({error.strerror}); a BOP folder needs this file") from error
-    return parse_json(data, str(file), kind)
+    return parse_bop_json(data, str(file), kind)
 
 
-def parse_json(data: bytes, name: str, kind: type = dict) -> Any:
+def parse_bop_json(data: bytes, name: str, kind: type = dict) -> Any:
     """Read JSON whose top level is a `kind` (dict or list).
 
     Args:

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS, find_image, read_mask
-from posecore.bop.jsonfile import id_of, integer_keys, parse_json
+from posecore.bop.jsonfile import id_of, integer_keys, parse_bop_json
 from posecore.errors import DatasetError
 
 Kind = Literal["camera", "gt", "gt_info"]
@@ -144,7 +144,7 @@ class FolderSource:
             return self._kept[key][0]
         file = self._file(scene_id, kind)
         data = StoredFile(path=file).read()
-        content = integer_keys(parse_json(data, str(file)), file)
+        content = integer_keys(parse_bop_json(data, str(file)), file)
         self._kept[key] = content, len(data)
         self._make_room(scene_id)
         return content

@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from posecore.bop.file_slice import StoredFile
 from posecore.bop.images import COLOUR_EXTENSIONS, DEPTH_EXTENSIONS
-from posecore.bop.jsonfile import id_of, integer, integer_keys, parse_json
+from posecore.bop.jsonfile import id_of, integer, integer_keys, parse_bop_json
 from posecore.bop.sources import Kind, Layer, MaskKind, some
 from posecore.errors import DatasetError
 from posecore.files import open_regular
@@ -101,7 +101,7 @@ class ShardSource:
         if file is None:
             there = some(self.im_ids(scene_id, kind))
             raise DatasetError(f"{self.annotation(scene_id, kind)}: no entry for image {im_id}; there are {there}")
-        return parse_json(file.read(), str(file), dict if kind == "camera" else list), str(file)
+        return parse_bop_json(file.read(), str(file), dict if kind == "camera" else list), str(file)
 
     def forget(self, scene_id: int) -> None:
         """Do nothing: no annotation is kept."""
@@ -120,7 +120,7 @@ class ShardSource:
         file = self._stored(scene_id, im_id, f"{kind}.json")
         if file is None:
             return None
-        masks = integer_keys(parse_json(file.read(), str(file)), str(file))
+        masks = integer_keys(parse_bop_json(file.read(), str(file)), str(file))
         where = f"{file}, mask {gt_index}"
         return None if gt_index not in masks else (decode_runs(masks[gt_index], where), where)
 

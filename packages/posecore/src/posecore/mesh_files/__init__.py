@@ -11,11 +11,11 @@ from posecore.mesh_files.images import refuse_pointer
 from posecore.mesh_files.obj import read_obj
 from posecore.mesh_files.off import read_off
 from posecore.mesh_files.part import GREY, MeshPart
-from posecore.mesh_files.ply import TIMES_COLOURS, read_ply
+from posecore.mesh_files.ply import MIP_LEVELS, TIMES_COLOURS, read_ply
 from posecore.mesh_files.stl import read_stl
 from posecore.mesh_files.surface import Surface, joined
 
-__all__ = ["GREY", "METRE_SUFFIXES", "SUFFIXES", "TIMES_COLOURS", "Surface", "mesh_bytes", "read_surface"]
+__all__ = ["GREY", "METRE_SUFFIXES", "MIP_LEVELS", "SUFFIXES", "TIMES_COLOURS", "Surface", "mesh_bytes", "read_surface"]
 
 logging.getLogger("trimesh").setLevel(logging.CRITICAL)  # it logs tracebacks of what is refused here in one line
 

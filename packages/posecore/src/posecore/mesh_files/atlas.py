@@ -16,11 +16,11 @@ log = logging.getLogger(__name__)
 LARGEST_ATLAS_PX = 8192
 """Side; larger textures are halved until all fit."""
 _MARGIN = 4
-"""Pixels around a piece that go on as the texture does, so that interpolation never reaches the neighbour."""
+"""Fewest pixels around a piece that go on as the texture does, so that interpolation never reaches the neighbour."""
+_MARGIN_PART = 8
+"""Side of the largest piece over the margin, where there is room: mip levels down to as many pixels are usable."""
 _MOST_TILES = 4
 """Repetitions of a texture that are drawn without further thought."""
-_SWATCH = 4
-"""Side of the piece of a part without a texture."""
 _FEWEST_TILE_PX = 4
 
 
@@ -69,25 +69,33 @@ def with_atlas(file: Path, parts: list[MeshPart]) -> list[MeshPart]:
         if part.texture is not None:
             groups.setdefault(id(part.texture), []).append(part)
     windows = {key: _window(group) for key, group in groups.items()}
-    swatches = {colour: _swatch(colour) for colour in (_plain_colour(p) for p in parts if p.texture is None)}
-    halvings = 0
+    colours = dict.fromkeys(_plain_colour(part) for part in parts if part.texture is None)
+    margin, halvings = 0, 0
     while True:
-        pieces = [_piece(groups[key][0].texture, window, halvings) for key, window in windows.items()]
-        corners, (width, height) = _packed([*pieces, *swatches.values()])
+        pieces = [_piece(groups[key][0].texture, window, halvings, margin) for key, window in windows.items()]
+        pieces += [_swatch(colour, margin) for colour in colours]
+        if not margin:
+            margin = _margin(pieces)
+            continue
+        corners, (width, height) = _packed(pieces)
         if max(width, height) <= LARGEST_ATLAS_PX:
             break
+        if margin > _MARGIN:
+            margin //= 2
+            continue
         halvings += 1
-        if any(min(piece.texture.rgb.shape[:2]) < _FEWEST_TILE_PX for piece in pieces):
+        if any(min(piece.texture.rgb.shape[:2]) < _FEWEST_TILE_PX for piece in pieces[: len(windows)]):
             raise MeshError(f"{file}: its textures repeat too often to be drawn together; bake them into one texture")
     if halvings:
         log.warning("%s: its textures are scaled down by %d to fit into %d px", file, 1 << halvings, LARGEST_ATLAS_PX)
     image = np.full((height, width, 3), 255, np.uint8)
-    for piece, (x, y) in zip([*pieces, *swatches.values()], corners, strict=True):
+    for piece, (x, y) in zip(pieces, corners, strict=True):
         image[y : y + piece.height, x : x + piece.width] = piece.pixels()
-    atlas = Texture(rgb=image)
-    located = dict(zip([*windows, *swatches], zip([*pieces, *swatches.values()], corners, strict=True), strict=True))
+    # a pixel of a mip level reaches 1.5 of its sides from where it is read
+    atlas = Texture(rgb=image, mip_levels=None if len(corners) == 1 else margin.bit_length() - 2)
+    located = dict(zip([*windows, *colours], zip(pieces, corners, strict=True), strict=True))
     return [
-        _on_swatch(part, atlas, located[_plain_colour(part)][1])
+        _on_swatch(part, atlas, *located[_plain_colour(part)])
         if part.texture is None
         else _in_window(part, atlas, *located[id(part.texture)])
         for part in parts
@@ -104,13 +112,19 @@ def _plain_colour(part: MeshPart) -> tuple[int, int, int]:
     return (red, green, blue)
 
 
-def _swatch(colour: tuple[int, int, int]) -> _Piece:
-    return _Piece(texture=Texture(rgb=np.array([[colour]], np.uint8)), x0=0, y0=0, width=_SWATCH, height=_SWATCH)
+def _margin(pieces: list[_Piece]) -> int:
+    """Pixels around each piece, a power of two; the fewest for a single piece, which has no neighbour."""
+    side = max(max(piece.width, piece.height) for piece in pieces) // _MARGIN_PART
+    return _MARGIN if len(pieces) == 1 else max(_MARGIN, 1 << max(side, 1).bit_length() - 1)
 
 
-def _on_swatch(part: MeshPart, atlas: Texture, corner: tuple[int, int]) -> MeshPart:
+def _swatch(colour: tuple[int, int, int], margin: int) -> _Piece:
+    return _Piece(texture=Texture(rgb=np.array([[colour]], np.uint8)), x0=0, y0=0, width=2 * margin, height=2 * margin)
+
+
+def _on_swatch(part: MeshPart, atlas: Texture, piece: _Piece, corner: tuple[int, int]) -> MeshPart:
     height, width = atlas.rgb.shape[:2]
-    middle = np.array([(corner[0] + _SWATCH / 2) / width, 1.0 - (corner[1] + _SWATCH / 2) / height])
+    middle = np.array([(corner[0] + piece.width / 2) / width, 1.0 - (corner[1] + piece.height / 2) / height])
     varies = part.rgb is not None and bool((part.rgb != part.rgb[0]).any())
     uv = np.tile(middle, (len(part.vertices), 1))
     return replace(part, uv=uv, texture=atlas, rgb=part.rgb if varies else None)
@@ -146,14 +160,7 @@ def _compact(part: MeshPart) -> MeshPart:
     rows = np.column_stack([part.faces.reshape(-1), np.repeat(shifts, 3, axis=0)])
     unique, inverse = np.unique(rows, axis=0, return_inverse=True)
     of_vertex = unique[:, 0].astype(np.int64)
-    return replace(
-        part,
-        vertices=part.vertices[of_vertex],
-        faces=inverse.reshape(-1, 3),
-        normals=None if part.normals is None else part.normals[of_vertex],
-        rgb=None if part.rgb is None else part.rgb[of_vertex],
-        uv=part.uv[of_vertex] - unique[:, 1:],
-    )
+    return part.picked(of_vertex, inverse.reshape(-1, 3), part.uv[of_vertex] - unique[:, 1:])
 
 
 def _window(parts: list[MeshPart]) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
@@ -163,7 +170,7 @@ def _window(parts: list[MeshPart]) -> tuple[Float[np.ndarray, "2"], Float[np.nda
 
 
 def _piece(
-    texture: Texture | None, window: tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]], halvings: int
+    texture: Texture | None, window: tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"]], halvings: int, margin: int
 ) -> _Piece:
     assert texture is not None
     rgb = texture.rgb
@@ -172,8 +179,8 @@ def _piece(
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))
     height, width = rgb.shape[:2]
     low, high = window
-    x0, x1 = int(np.floor(low[0] * width)) - _MARGIN, int(np.ceil(high[0] * width)) + _MARGIN
-    y0, y1 = int(np.floor((1 - high[1]) * height)) - _MARGIN, int(np.ceil((1 - low[1]) * height)) + _MARGIN
+    x0, x1 = int(np.floor(low[0] * width)) - margin, int(np.ceil(high[0] * width)) + margin
+    y0, y1 = int(np.floor((1 - high[1]) * height)) - margin, int(np.ceil((1 - low[1]) * height)) + margin
     return _Piece(texture=replace(texture, rgb=rgb), x0=x0, y0=y0, width=x1 - x0, height=y1 - y0)
 
 

@@ -21,7 +21,8 @@ from scipy.spatial.transform import Rotation
 from posecore.errors import MeshError
 from posecore.mesh_files.gltf_buffers import Buffers
 from posecore.mesh_files.gltf_materials import Materials
-from posecore.mesh_files.part import MeshPart, display_from_linear, to_bytes
+from posecore.mesh_files.part import MeshPart
+from posecore.srgb import display_from_linear, to_bytes
 
 HONOURED = (
     "KHR_mesh_quantization", "KHR_texture_transform", "KHR_materials_pbrSpecularGlossiness", "KHR_materials_unlit",

@@ -14,7 +14,8 @@ from posecore.errors import MeshError
 from posecore.mesh_files.gltf_buffers import Buffers
 from posecore.mesh_files.images import DecodedImage, decode
 from posecore.mesh_files.mtl import HOLE, NEARLY_OPAQUE
-from posecore.mesh_files.part import Texture, Wrap, display_from_linear, linear_from_display, to_bytes
+from posecore.mesh_files.part import Texture, Wrap
+from posecore.srgb import display_from_linear, linear_from_display, to_bytes
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from posecore.errors import MeshError, TextureError
 from posecore.files import read_regular
@@ -127,7 +127,7 @@ def decode(file: Path, name: str, data: bytes) -> DecodedImage:
             image = Image.open(io.BytesIO(data), formats=_FORMATS)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
         raise _too_large(file, name, "far more") from error
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+    except Exception as error:  # whatever Pillow's parsers meet in a damaged file
         raise MeshError(f"{file}: its texture {name} is not an image; expected PNG, JPEG or alike") from error
     width, height = image.size
     if max(width, height) > LARGEST_SIDE_PX or width * height > LARGEST_AREA_PX:
@@ -135,7 +135,9 @@ def decode(file: Path, name: str, data: bytes) -> DecodedImage:
     try:
         image.load()
         return _picture(file, name, image)
-    except (OSError, ValueError, SyntaxError, IndexError, MemoryError, EOFError) as error:
+    except MeshError:
+        raise
+    except Exception as error:
         reason = str(error).splitlines()[0][:80] if str(error) else type(error).__name__
         raise MeshError(
             f"{file}: its texture cannot be decoded: {name} is cut off or damaged ({reason}); export it again"

@@ -15,8 +15,9 @@ from trimesh.exchange.obj import load_obj
 from posecore.errors import MeshError, TextureError
 from posecore.mesh_files.images import DecodedImage, beside, decode, linked_bytes, missing
 from posecore.mesh_files.mtl import HOLE, NEARLY_OPAQUE, MaterialMap, MtlMaterial, read_materials
-from posecore.mesh_files.part import MeshPart, Texture, decoded, to_bytes, two_looks
+from posecore.mesh_files.part import MeshPart, Texture, decoded, two_looks
 from posecore.mesh_files.polygons import concave, ears, polygon_fingerprints, repeated
+from posecore.srgb import to_bytes
 
 log = logging.getLogger(__name__)
 

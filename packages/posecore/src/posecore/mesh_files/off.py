@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from posecore.errors import MeshError
-from posecore.mesh_files.part import MeshPart, decoded, to_bytes
+from posecore.mesh_files.part import MeshPart, decoded, refuse_bad_indices
 from posecore.mesh_files.polygons import triangles_of
+from posecore.srgb import to_bytes
 
 
 def read_off(file: Path, data: bytes) -> list[MeshPart]:
@@ -75,11 +76,7 @@ def _polygons(
         if len(row) < size + 1:
             raise MeshError(f"{file}: is cut off, face {number} has {len(row) - 1} of {size} vertices; copy it again")
         polygon = np.array(row[1 : size + 1], np.int64)
-        if polygon.min(initial=0) < 0 or polygon.max(initial=0) >= n_vertices:
-            raise MeshError(
-                f"{file}: face {number} names the vertices {polygon.tolist()}, expected 0 to {n_vertices - 1}; "
-                "repair the mesh"
-            )
+        refuse_bad_indices(file, polygon[None], n_vertices, number)
         polygons.append(polygon)
         colours.append(row[size + 1 :])
     return polygons, _colours(colours)

@@ -1,11 +1,13 @@
 """A part of a mesh file: triangles that share a look, before parts are joined to a mesh."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+
+from posecore.errors import MeshError
 
 GREY = 160
 """Display value of surfaces to which a file gives no colour."""
@@ -19,10 +21,12 @@ class Texture:
     Attributes:
         rgb: (h, w, 3) display colours, row 0 at the top.
         wrap: What follows beyond texture coordinates of [0, 1], along u and along v.
+        mip_levels: How often it may be halved before materials that share it mix; None: ever.
     """
 
     rgb: UInt8[np.ndarray, "h w 3"]
     wrap: tuple[Wrap, Wrap] = ("repeat", "repeat")
+    mip_levels: int | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,21 +51,38 @@ class MeshPart:
     texture: Texture | None = None
     is_flat: bool = False
 
+    def picked(
+        self, rows: Int[np.ndarray, " n"], faces: Int[np.ndarray, "f 3"], uv: Float[np.ndarray, "n 2"] | None = None
+    ) -> "MeshPart":
+        """The part with these of its vertices, in this order; with other texture coordinates, where they are given."""
+        return replace(
+            self,
+            vertices=self.vertices[rows],
+            faces=faces,
+            normals=None if self.normals is None else self.normals[rows],
+            rgb=None if self.rgb is None else self.rgb[rows],
+            uv=uv if uv is not None or self.uv is None else self.uv[rows],
+        )
 
-def linear_from_display(values: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Linear light of display (sRGB) values in [0, 1] (IEC 61966-2-1)."""
-    return np.asarray(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4))
 
+def refuse_bad_indices(file: Path, faces: Int[np.ndarray, "f k"], n_vertices: int, first: int = 0) -> None:
+    """Refuse faces that name vertices which are not there.
 
-def display_from_linear(values: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Display (sRGB) values of linear light, which is clipped to [0, 1] (IEC 61966-2-1)."""
-    light = np.clip(values, 0.0, 1.0)
-    return np.asarray(np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055))
+    Args:
+        file: For the message.
+        faces: Faces.
+        n_vertices: Number of vertices.
+        first: Number of the first face in the file.
 
-
-def to_bytes(values: Float[np.ndarray, "*b"]) -> UInt8[np.ndarray, "*b"]:
-    """8-bit values of values in [0, 1]."""
-    return np.asarray(np.rint(np.clip(values, 0.0, 1.0) * 255.0).astype(np.uint8))
+    Raises:
+        MeshError: A face names a vertex below 0 or beyond the last one.
+    """
+    if faces.min(initial=0) < 0 or faces.max(initial=0) >= n_vertices:
+        bad = int(np.flatnonzero(((faces < 0) | (faces >= n_vertices)).any(axis=1))[0])
+        raise MeshError(
+            f"{file}: face {first + bad} names the vertices {faces[bad].tolist()}, expected 0 to {n_vertices - 1}; "
+            "repair the mesh"
+        )
 
 
 def two_looks(file: Path) -> str:

@@ -15,14 +15,17 @@ from trimesh.visual import texture as trimesh_texture
 
 from posecore.errors import MeshError
 from posecore.mesh_files.images import beside, decode, linked_bytes, missing
-from posecore.mesh_files.part import MeshPart, Texture, to_bytes
+from posecore.mesh_files.part import MeshPart, Texture, refuse_bad_indices
 from posecore.mesh_files.polygons import triangles_of
 from posecore.ply import refuse_broken_ply
+from posecore.srgb import to_bytes
 
 log = logging.getLogger(__name__)
 
 TIMES_COLOURS = "comment TextureTimesVertexColours"
 """Header line of a PLY whose vertex colours are a factor on its texture; elsewhere a texture stands for them."""
+MIP_LEVELS = "comment TextureMipLevels"
+"""Header line of a PLY with the number of halvings after which materials would mix in its texture."""
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 _UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"), ("texture_s", "texture_t"))
 _BINARY = {
@@ -58,12 +61,7 @@ def read_ply(file: Path, data: bytes, *, allow_missing_textures: bool = False) -
     vertices = np.asarray(loaded["vertices"], np.float64)
     table, face_table = raw["vertex"]["data"], raw["face"]["data"]
     faces, polygon = _triangles(loaded["faces"], face_table, vertices)
-    if faces.min(initial=0) < 0 or faces.max(initial=0) >= len(vertices):
-        bad = int(np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))[0])
-        raise MeshError(
-            f"{file}: face {bad} names the vertices {faces[bad].tolist()}, expected 0 to {len(vertices) - 1}; "
-            "repair the mesh"
-        )
+    refuse_bad_indices(file, faces, len(vertices))
     part = MeshPart(
         vertices=vertices,
         faces=faces,
@@ -255,6 +253,7 @@ def _colours(file: Path, table: Any) -> UInt8[np.ndarray, "n 3"] | None:
 
 def _textures(file: Path, header: list[str], allow_missing_textures: bool) -> list[Texture]:
     textures = []
+    levels = [int(word) for line in header if line.startswith(MIP_LEVELS) and (word := line.split()[-1]).isdecimal()]
     for line in header:
         if not line.lower().startswith("comment texturefile"):
             continue
@@ -263,7 +262,8 @@ def _textures(file: Path, header: list[str], allow_missing_textures: bool) -> li
         try:
             if path is None:
                 raise missing(file, "texture", file.parent, name)
-            textures.append(Texture(rgb=decode(file, str(path), linked_bytes(file, path)).rgb))
+            picture = decode(file, str(path), linked_bytes(file, path))
+            textures.append(Texture(rgb=picture.rgb, mip_levels=min(levels, default=None)))
         except MeshError:
             if not allow_missing_textures:
                 raise
@@ -289,7 +289,7 @@ def _textured(
         unique: Any = unique_rows
         rows, inverse = unique(corners)  # trimesh orders the vertices by it, and hashes hang on that
         faces, of_vertex, of_uv = _unmerged(part.faces, inverse.reshape(part.faces.shape))
-        part = _picked(part, of_vertex, faces, corners[rows][of_uv])
+        part = part.picked(of_vertex, faces, corners[rows][of_uv])
     elif vertex_uv is not None:
         part = replace(part, uv=vertex_uv.astype(np.float64))
     else:
@@ -313,29 +313,12 @@ def _textured(
     ]
 
 
-def _picked(
-    part: MeshPart,
-    rows: Int[np.ndarray, " n"],
-    faces: Int[np.ndarray, "f 3"],
-    uv: Float[np.ndarray, "n 2"] | None = None,
-) -> MeshPart:
-    """The part with these vertices, in this order."""
-    return replace(
-        part,
-        vertices=part.vertices[rows],
-        faces=faces,
-        normals=None if part.normals is None else part.normals[rows],
-        rgb=None if part.rgb is None else part.rgb[rows],
-        uv=uv if uv is not None or part.uv is None else part.uv[rows],
-    )
-
-
 def _unshared(part: MeshPart, face_rgb: UInt8[np.ndarray, "f 3"]) -> MeshPart:
     """The part with the colours of its faces: vertices are split where colours meet."""
     colours, of_face = np.unique(face_rgb, axis=0, return_inverse=True)
     key = np.repeat(of_face.reshape(-1, 1), 3, axis=1)
     faces, of_vertex, of_colour = _unmerged(part.faces, key)
-    return replace(_picked(part, of_vertex, faces), rgb=colours[of_colour])
+    return replace(part.picked(of_vertex, faces), rgb=colours[of_colour])
 
 
 def _unmerged(

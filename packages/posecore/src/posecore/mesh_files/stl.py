@@ -10,7 +10,8 @@ from jaxtyping import Int, UInt8
 from trimesh.exchange.stl import load_stl
 
 from posecore.errors import MeshError
-from posecore.mesh_files.part import GREY, MeshPart, to_bytes
+from posecore.mesh_files.part import GREY, MeshPart
+from posecore.srgb import to_bytes
 
 _HEADER, _FACET = 84, 50
 

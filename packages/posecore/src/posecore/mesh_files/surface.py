@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 
 from posecore.errors import MeshError
 from posecore.mesh_files.atlas import needs_atlas, with_atlas
-from posecore.mesh_files.part import GREY, MeshPart, two_looks
+from posecore.mesh_files.part import GREY, MeshPart, refuse_bad_indices, two_looks
 from posecore.mesh_files.polygons import fingerprints, repeated
 
 
@@ -23,6 +23,7 @@ class Surface:
     rgb: UInt8[np.ndarray, "v 3"] | None
     uv: Float[np.ndarray, "v 2"] | None
     texture_rgb: UInt8[np.ndarray, "h w 3"] | None
+    mip_levels: int | None
     has_normals: bool
 
 
@@ -63,6 +64,7 @@ def joined(file: Path, parts: list[MeshPart]) -> Surface:
         rgb=rgb,
         uv=None if uv is None else uv.astype(np.float32),
         texture_rgb=None if texture is None else texture.rgb,
+        mip_levels=None if texture is None else texture.mip_levels,
         has_normals=has_normals,
     )
 
@@ -77,12 +79,7 @@ def _refuse_bad_vertices(file: Path, parts: list[MeshPart]) -> None:
                 f"{file}: vertex {start + bad} is {part.vertices[bad].tolist()}, expected finite numbers; "
                 "repair the mesh"
             )
-        if part.faces.min() < 0 or part.faces.max() >= len(part.vertices):
-            bad = int(np.flatnonzero(((part.faces < 0) | (part.faces >= len(part.vertices))).any(axis=1))[0])
-            raise MeshError(
-                f"{file}: face {bad} names the vertices {part.faces[bad].tolist()}, expected 0 to "
-                f"{len(part.vertices) - 1}; repair the mesh"
-            )
+        refuse_bad_indices(file, part.faces, len(part.vertices))
         if part.uv is not None and not np.isfinite(part.uv).all():
             raise MeshError(f"{file}: a texture coordinate is not a finite number; export the mesh again")
         start += len(part.vertices)
@@ -157,10 +154,4 @@ def _with_normals(part: MeshPart) -> MeshPart:
 def _flat(part: MeshPart) -> MeshPart:
     """The part with vertices of their own for each face."""
     corners = part.faces.reshape(-1)
-    return replace(
-        part,
-        vertices=part.vertices[corners],
-        faces=np.arange(len(corners)).reshape(-1, 3),
-        rgb=None if part.rgb is None else part.rgb[corners],
-        uv=None if part.uv is None else part.uv[corners],
-    )
+    return part.picked(corners, np.arange(len(corners)).reshape(-1, 3))

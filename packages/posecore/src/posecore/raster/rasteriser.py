@@ -365,7 +365,7 @@ class Rasteriser:
             height, width = drawn.texture_rgb.shape[:2]
             flipped = np.ascontiguousarray(drawn.texture_rgb[::-1])  # GL's first row is the bottom one
             texture = self._context.texture((width, height), 3, flipped.tobytes(), alignment=1)
-            texture.build_mipmaps()
+            texture.build_mipmaps(max_level=1000 if drawn.mip_levels is None else drawn.mip_levels)  # GL's default
             texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._textures[obj_id] = texture
         return arrays[number]

@@ -1,11 +1,15 @@
 """Correlation (cost volume) of two patches: of learned features, or of gradient orientations without learning."""
 
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
 from refinenet.image.edge_gradients import OUTLINE
+from refinenet.models.kernels import window_similarity
 
 HALF_STRENGTH = {"render": 24.0, "scene": 12.0}
 """Gradients of weight one half, in grey levels over two pixels: lens and resampling soften the image's edges."""
@@ -84,9 +88,35 @@ class GradientCorrelation(nn.Module):
         )  # fmt: skip
         amounts = torch.stack([torch.linalg.vector_norm(render[:, i : i + 2], dim=1) for i in (0, 2)], 1)
         amounts = _around(avg_pool2d(amounts, 2))
+        compiled = render.device.type == "cpu" and render.dtype == torch.float32 and not torch.compiler.is_compiling()
+        relative = (self._on_processor if compiled else self._relative)(render, image, amounts)
+        return torch.cat((relative, amounts), 1)
+
+    def _on_processor(
+        self, render: Float[Tensor, "b 4 n n"], image: Float[Tensor, "b 4 n n"], amounts: Float[Tensor, "b 2 m m"]
+    ) -> Float[Tensor, "b k m m"]:
+        """`_relative` in a compiled loop, each thread with a part of the batch."""
+        b, r = len(render), self.radius
+        result = amounts.new_empty((b, 2 * self.side**2, *amounts.shape[2:]))
+        tensors = (render.contiguous(), pad(image, (r, r, r, r)), amounts.contiguous())
+        threads = min(torch.get_num_threads(), b)
+        parts = [slice(b * i // threads, b * (i + 1) // threads) for i in range(threads)]
+
+        def compute(part: slice) -> None:
+            window_similarity(*(x[part].numpy() for x in tensors), np.float32(MIN_EDGE_FRACTION), result[part].numpy())
+
+        if threads == 1:
+            compute(parts[0])
+        else:
+            with ThreadPoolExecutor(threads) as pool:
+                list(pool.map(compute, parts))
+        return result
+
+    def _relative(
+        self, render: Float[Tensor, "b 4 n n"], image: Float[Tensor, "b 4 n n"], amounts: Float[Tensor, "b 2 m m"]
+    ) -> Float[Tensor, "b k m m"]:
         similarity = _around(self._similarity(render, image)).unflatten(1, (2, -1))
-        relative = similarity / (amounts[:, :, None] + MIN_EDGE_FRACTION)
-        return torch.cat((relative.flatten(1, 2), amounts), 1)
+        return (similarity / (amounts[:, :, None] + MIN_EDGE_FRACTION)).flatten(1, 2)
 
     def _similarity(
         self, render: Float[Tensor, "b 4 n n"], image: Float[Tensor, "b 4 n n"]

@@ -3,6 +3,7 @@
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
+from posecore import srgb
 
 from synthgen.scene import Sensor
 
@@ -57,9 +58,4 @@ def _motion_kernel(length_px: float, angle_rad: float) -> Float[np.ndarray, "k k
     return np.asarray(kernel / kernel.sum())
 
 
-def _linear_table() -> Float[np.ndarray, "256"]:
-    x = np.arange(256, dtype=np.float64) / 255.0
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-_LINEAR = _linear_table()
+_LINEAR = srgb.linear_from_display(np.arange(256) / 255.0).astype(np.float32)

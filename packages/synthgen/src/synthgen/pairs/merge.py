@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from posecore import shard
-from posecore.bop.jsonfile import id_of, parse_json
+from posecore.bop.jsonfile import id_of, parse_bop_json
 from posecore.bop.models_info import load_model_info
 from posecore.errors import ShardError
 from posecore.mesh import mesh_digest
@@ -95,7 +95,7 @@ def open_parts(urls: Sequence[str]) -> list[ShardReader]:
 def _model_entries(part: ShardReader) -> dict[str, Any]:
     """Entries of a dataset's `models_info.json` by object id as text, each one checked."""
     where = f"{part.url}/{MODELS_INFO}"
-    entries: dict[str, Any] = parse_json(part.file(MODELS_INFO), where)
+    entries: dict[str, Any] = parse_bop_json(part.file(MODELS_INFO), where)
     for obj_id, entry in entries.items():
         load_model_info(entry, f"{where}, object {obj_id}")
         if id_of(obj_id) is None:

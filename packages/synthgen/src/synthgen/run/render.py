@@ -177,9 +177,8 @@ def render_dataset(
             test_images=job.test_images,
         )  # fmt: skip
         on_plan(plan)
-        test_set.render_test_set(
-            job.out, job.test_images, shards, job.sources, workers=1 if gpus else workers, on_image=on_image
-        )
+        processes = test_set.image_workers(shards.config, workers, has_gpu=bool(gpus))
+        test_set.render_test_set(job.out, job.test_images, shards, job.sources, workers=processes, on_image=on_image)
         dispatcher.run(
             shards,
             writer,
@@ -267,16 +266,17 @@ def _duration_text(seconds: float) -> str:
 
 @contextmanager
 def _removed_if_useless(new: Path | None) -> Iterator[None]:
-    """Remove a new folder when an error ends the run before the first commit.
+    """Remove a new folder when an error ends the run before the first commit; test images that serve again keep it.
 
-    Its data card would refuse the same command with a corrected setting.
+    Its data card would refuse the same command with a corrected setting. Finished test images are kept in any case.
 
     Args:
         new: A folder that did not exist before the run; None when it did.
     """
     try:
         yield
-    except PoseError:
-        if new is not None and not (new / MANIFEST).exists():
+    except PoseError as error:
+        needs_correction = isinstance(error, ConfigError)
+        if new is not None and not (new / MANIFEST).exists() and not test_set.has_images(new, whole=needs_correction):
             shutil.rmtree(new, ignore_errors=True)
         raise

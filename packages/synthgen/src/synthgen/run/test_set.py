@@ -19,6 +19,8 @@ PAIRS_PER_IMAGE = 10
 SEED_DISTANCE = 1_000_000_007
 """Seed of the test images minus that of the pairs: no dataset of a nearby seed shows the same scenes."""
 LARGEST_SEED = 2**63 - 1
+TARGETS = "test_targets_bop19.json"
+"""The last file of finished test images, but for that of another challenge."""
 
 
 def default_count(n: int, out: str, scheduler: str | None = None) -> int:
@@ -47,7 +49,7 @@ def render_test_set(
         count: Number of images; 0 renders none.
         shards: Shards of the dataset: their configuration, meshes and assets are those of the images.
         sources: Paths of the meshes' symmetries.
-        workers: Local processes. A Blender engine always runs in processes of its own.
+        workers: See `image_workers`.
         on_image: Called for every image on disk, with 1.
 
     Raises:
@@ -55,20 +57,40 @@ def render_test_set(
     """
     if not count:
         return
+    meshes = {obj_id: mesh.with_levels(()) for obj_id, mesh in shards.meshes.items()}  # BOP datasets have every face
+    occluders = tuple(mesh.with_levels(()) for mesh in shards.assets.occluders)
     try:
         write_dataset(
             Path(out) / TEST_SET,
-            images_config(shards.config, len(shards.meshes)),
-            shards.meshes,
+            images_config(shards.config, len(meshes)),
+            meshes,
             FramePlan(frames=count),
-            assets=shards.assets,
-            infos=sources.infos(shards.meshes),
-            workers=workers if shards.config.engine == "raster" else max(2, workers),
+            assets=replace(shards.assets, occluders=occluders),
+            infos=sources.infos(meshes),
+            workers=workers,
             on_frame=lambda scene_id, im_id: on_image(1),
         )
     except ConfigError as error:
         estimate(shards, scenes=1)  # pairs that cannot be drawn either name the setting to blame
         raise ConfigError(f"test images: {error}; or leave them out with --test-images 0") from error
+
+
+def image_workers(config: SynthConfig, workers: int, *, has_gpu: bool) -> int:
+    """Number of processes for the test images; 1 is this process, where no Blender engine may run.
+
+    Args:
+        config: Configuration of the pairs.
+        workers: Processes of the pairs.
+        has_gpu: Whether Cycles renders on a GPU, which a whole image fills.
+    """
+    fewest = 1 if config.engine == "raster" else 2
+    return fewest if has_gpu else max(fewest, workers)
+
+
+def has_images(out: Path, *, whole: bool) -> bool:
+    """Whether a dataset has a test image; with `whole`, whether the last one is finished."""
+    folder = out / TEST_SET
+    return (folder / TARGETS).exists() or (not whole and any(folder.glob("*/*/scene_gt.json")))
 
 
 def images_config(config: SynthConfig, objects: int) -> SynthConfig:

@@ -2,8 +2,9 @@
 
 import bpy
 import numpy as np
+from posecore.srgb import linear_from_display
 
-from synthgen.engines.blender.meshes import COLOUR_ATTRIBUTE, UV_LAYER, linear_from_srgb
+from synthgen.engines.blender.meshes import COLOUR_ATTRIBUTE, UV_LAYER
 from synthgen.scene import Material, Pattern
 
 INDEX_AOV = "object_index"
@@ -54,11 +55,11 @@ def make_surface(name: str, texture: bpy.types.Image | None, *, has_colours: boo
 
 def set_material(thing: bpy.types.Object, material: Material) -> None:
     """Set the custom properties of an object to `material`."""
-    rgb = (0.0, 0.0, 0.0) if material.base_rgb is None else linear_from_srgb(np.array(material.base_rgb)).tolist()
+    rgb = (0.0, 0.0, 0.0) if material.base_rgb is None else linear_from_display(np.array(material.base_rgb)).tolist()
     pattern = material.pattern or Pattern(accent_rgb=(0.0, 0.0, 0.0), wave=(0.0, 0.0, 0.0))
     properties = {
         PAINT: tuple(rgb),
-        ACCENT: tuple(linear_from_srgb(np.array(pattern.accent_rgb)).tolist()),
+        ACCENT: tuple(linear_from_display(np.array(pattern.accent_rgb)).tolist()),
         WAVE: pattern.wave,
         WARP: pattern.warp,
         # bend, steepness, offset; without a pattern the accent's fraction is 0

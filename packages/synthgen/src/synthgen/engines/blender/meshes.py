@@ -5,14 +5,10 @@ import numpy as np
 from jaxtyping import Float
 from posecore.errors import MeshError
 from posecore.mesh import Mesh
+from posecore.srgb import linear_from_display
 
 COLOUR_ATTRIBUTE = "colour"
 UV_LAYER = "uv"
-
-
-def linear_from_srgb(srgb: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Return linear values of display values in [0, 1] (IEC 61966-2-1)."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def make_mesh(key: int, mesh: Mesh) -> bpy.types.Mesh:
@@ -41,7 +37,7 @@ def make_mesh(key: int, mesh: Mesh) -> bpy.types.Mesh:
     colours = block.color_attributes.new(COLOUR_ATTRIBUTE, "FLOAT_COLOR", "POINT")
     rgba = np.ones((len(vertices), 4), np.float32)
     # Beside a texture they are a factor on it.
-    rgba[:, :3] = linear_from_srgb((mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb) / 255.0)
+    rgba[:, :3] = linear_from_display((mesh.colours if mesh.vertex_rgb is None else mesh.vertex_rgb) / 255.0)
     colours.data.foreach_set("color", rgba.ravel())
     if mesh.uv is not None:
         layer = block.uv_layers.new(name=UV_LAYER)
