@@ -1,5 +1,6 @@
 """Correlation (cost volume) of two patches: of learned features, or of gradient orientations without learning."""
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -9,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad
 
 from refinenet.image.edge_gradients import OUTLINE
-from refinenet.models.kernels import window_similarity
+from refinenet.models.kernels import lightness_gradient, strongest_gradient, window_similarity
 
 HALF_STRENGTH = {"render": 24.0, "scene": 12.0}
 """Gradients of weight one half, in grey levels over two pixels: lens and resampling soften the image's edges."""
@@ -88,11 +89,10 @@ class GradientCorrelation(nn.Module):
         )  # fmt: skip
         amounts = torch.stack([torch.linalg.vector_norm(render[:, i : i + 2], dim=1) for i in (0, 2)], 1)
         amounts = _around(avg_pool2d(amounts, 2))
-        compiled = render.device.type == "cpu" and render.dtype == torch.float32 and not torch.compiler.is_compiling()
-        relative = (self._on_processor if compiled else self._relative)(render, image, amounts)
+        relative = (self._in_a_loop if has_loop(render) else self._relative)(render, image, amounts)
         return torch.cat((relative, amounts), 1)
 
-    def _on_processor(
+    def _in_a_loop(
         self, render: Float[Tensor, "b 4 n n"], image: Float[Tensor, "b 4 n n"], amounts: Float[Tensor, "b 2 m m"]
     ) -> Float[Tensor, "b k m m"]:
         """`_relative` in a compiled loop, each thread with a part of the batch."""
@@ -138,11 +138,26 @@ class GradientCorrelation(nn.Module):
         return torch.stack(products, 1).permute(5, 0, 1, 3, 2, 4).flatten(1, 3) / 4
 
 
+def has_loop(values: Tensor) -> bool:
+    """Whether a compiled loop computes this: on a processor, without a gradient, and in no exported network."""
+    is_plain = values.device.type == "cpu" and values.dtype == torch.float32 and not values.requires_grad
+    return is_plain and not torch.compiler.is_compiling()
+
+
 def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
     """Means over windows of three cells, zeros beyond the border; several times as fast as torch's on a processor."""
     planes = pad(planes, (1, 1, 1, 1))
     rows = planes[..., :-2, :] + planes[..., 1:-1, :] + planes[..., 2:, :]
     return (rows[..., :-2] + rows[..., 1:-1] + rows[..., 2:]) / 9
+
+
+def _cells(
+    loop: Callable[..., None], values: Float[Tensor, "b c p p"], half_strength: float
+) -> Float[Tensor, "b 2 n n"]:
+    b, _, p, q = values.shape
+    result = values.new_empty((b, 2, p // 2, q // 2))
+    loop(values.contiguous().numpy(), np.float32(half_strength**2), result.numpy())
+    return result
 
 
 def feature_gradients(values: Float[Tensor, "b c p p"]) -> tuple[Float[Tensor, "b c p p"], Float[Tensor, "b c p p"]]:
@@ -159,6 +174,8 @@ def orientations(values: Float[Tensor, "b c p p"], half_strength: float) -> Floa
 
     Means over cells of two pixels.
     """
+    if has_loop(values):
+        return _cells(strongest_gradient, values, half_strength)
     dx, dy = feature_gradients(values)
     x, y = dx[:, :1], dy[:, :1]
     square = x.square() + y.square()
@@ -173,6 +190,8 @@ def orientations(values: Float[Tensor, "b c p p"], half_strength: float) -> Floa
 
 def directions(values: Float[Tensor, "b 3 p p"], half_strength: float) -> Float[Tensor, "b 2 n n"]:
     """Cosine and sine of the lightness gradient's angle, times a strength under 1; means over cells of two pixels."""
+    if has_loop(values):
+        return _cells(lightness_gradient, values, half_strength)
     dx, dy = feature_gradients(values.mean(1, keepdim=True))
     weight = torch.rsqrt(dx.square() + dy.square() + half_strength**2)
     return avg_pool2d(torch.cat((dx * weight, dy * weight), 1), 2)
