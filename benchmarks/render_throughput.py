@@ -23,13 +23,13 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+from other_commit import Environment, packages_of
 from posecore import shard
 from posecore.camera import Camera
 from posecore.mesh import Mesh
@@ -42,10 +42,6 @@ from synthgen.pairs.pair_maker import PairMaker, concatenate, limit_threads
 from synthgen.run.render import RenderJob, shard_job
 
 Fields = dict[str, Any]
-Environment = dict[str, str]
-
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("posecore", "synthgen", "refinenet", "evalkit")
 
 
 class Stopwatch:
@@ -109,22 +105,6 @@ def stages(config: SynthConfig, meshes: dict[int, Mesh], assets: Assets, scenes:
 def scenes_per_shard(config: SynthConfig) -> int:
     """Scenes in a full shard."""
     return config.shard_size // config.hypotheses_per_scene
-
-
-@contextmanager
-def packages_of(commit: str | None) -> Iterator[Environment | None]:
-    """Environment in which Python imports the four packages of a commit; of this checkout, inherited, for None."""
-    if commit is None:
-        yield None
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        git = ["git", "-C", str(ROOT), "worktree"]
-        subprocess.run([*git, "add", "--detach", folder, commit], check=True, capture_output=True)
-        try:
-            sources = os.pathsep.join(f"{folder}/packages/{name}/src" for name in PACKAGES)
-            yield {**os.environ, "PYTHONPATH": sources}
-        finally:
-            subprocess.run([*git, "remove", "--force", folder], check=True)
 
 
 def throughput(arguments: argparse.Namespace, command: list[str], environment: Environment | None = None) -> float:
