@@ -102,7 +102,8 @@ class _Positions:
 
     def _fitting(self, point: Int[np.ndarray, " c"], normal: Float[np.ndarray, "c 3"]) -> Int[np.ndarray, " c"]:
         """Of the members of each point, the index of the first whose normal is nearest to the one given."""
-        index, count = self._begin[point], np.diff(self._begin)[point]
+        index: Int[np.ndarray, " c"] = self._begin[point]
+        count = np.diff(self._begin)[point]
         several = np.flatnonzero(count > 1)
         count = count[several]
         if not len(several):

@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from posecore.bop.models_info import ModelInfo, load_models_info, symmetry_transforms
+from posecore.detail import with_levels
 from posecore.errors import DatasetError
 from posecore.mesh import Mesh
 from posecore.shard import ShardReader
-from posecore.simplify import simplified
 from posecore.symmetry import ball_center_m, is_ball
 
 from refinenet.config import Pivot
@@ -36,9 +36,9 @@ def pivot_frames(meshes: Mapping[int, Mesh], pivot: Pivot) -> PivotFrames:
     return PivotFrames.at(meshes, {obj_id: np.zeros(3) for obj_id in meshes})
 
 
-def for_patches(meshes: Mapping[int, Mesh], patch_px: int) -> dict[int, Mesh]:
-    """Meshes for rendering hypotheses in training, simplified to one face for each pixel of a patch."""
-    return {obj_id: simplified(mesh, patch_px**2) for obj_id, mesh in meshes.items()}
+def for_patches(meshes: Mapping[int, Mesh]) -> dict[int, Mesh]:
+    """Meshes for rendering hypotheses in training, with levels of detail: a patch shows few of many faces."""
+    return {obj_id: with_levels(mesh) for obj_id, mesh in meshes.items()}
 
 
 def load_models(reader: ShardReader) -> dict[int, ModelInfo]:

@@ -58,7 +58,7 @@ class PairSource:
         if config.makes_pairs_online:
             meshes = self.frames.meshes
             models = self.frames.models(load_models(self.reader))
-            self._rasteriser = Rasteriser(for_patches(meshes, config.network.patch_px))
+            self._rasteriser = Rasteriser(for_patches(meshes))
             self._make = OnlinePairMaker(
                 meshes=meshes,
                 rasteriser=self._rasteriser,

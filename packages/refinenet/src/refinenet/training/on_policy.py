@@ -162,7 +162,7 @@ class OnPolicyHypotheses:
         patch_px = self._config.network.patch_px
         K_new = np.stack([crop_K(K[i], window, patch_px) for i, window in zip(drawn, cut, strict=True)])
         if self._rasteriser is None:
-            self._rasteriser = Rasteriser(for_patches(self._meshes, patch_px))
+            self._rasteriser = Rasteriser(for_patches(self._meshes))
         obj_ids = np.array(self._obj_ids)[index[drawn]]
         layers = self._rasteriser.render(obj_ids, K_new, T[drawn], patch_px, patch_px)
         rgb, depth = layers.rgb, layers.depth_m
