@@ -3,13 +3,13 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+from children import run as run_command
 from click.testing import CliRunner
 from evalkit.cli import main as evalkit
 from posecore.bop import BopDataset, read_results, read_sidecar, write_results
@@ -74,9 +74,7 @@ def run(line, folder):
     program, *arguments = line.split()
     module = {"synthgen": "synthgen.cli", "refinenet": "refinenet", "evalkit": "evalkit.cli"}[program]
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", module, *arguments], cwd=folder, env=environment, capture_output=True, text=True
-    )
+    done = run_command([sys.executable, "-m", module, *arguments], cwd=folder, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
     return done
 

@@ -76,27 +76,34 @@ def test_a_shorter_dataset_starts_with_the_same_samples(reference, tmp_path, tug
 
 
 @pytest.mark.slow
-def test_killing_it_at_random_moments_changes_no_byte(reference, tmp_path, tug_ply, small_set):
+def test_killing_it_at_random_writes_changes_no_byte(reference, tmp_path, tug_ply, small_set):
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, small_set, "--n", "22", "--workers", "2")
-    rng = np.random.default_rng(1)
-    killed = 0
-    for _ in range(8):
+    rng, before = np.random.default_rng(1), len(field_table())  # writes of a shard; six are to be written
+    for writes in (rng.integers(before), before + rng.integers(before)):
         # its own session, so that the test can see whether workers outlive a killed parent
-        with children.started(arguments, stderr=subprocess.DEVNULL) as process:
-            while process.poll() is None and not list(out.glob("scene_rgb/c/*")):
-                time.sleep(0.02)
-            time.sleep(rng.uniform(0.0, 0.4))
-            if process.poll() is not None:
-                break
-            process.kill()
-            process.wait()
-            killed += 1
+        killed = [sys.executable, "-c", KILLED_AT, str(writes), *arguments[3:]]
+        with children.started(killed, stderr=subprocess.DEVNULL) as process:
+            assert process.wait() == -signal.SIGKILL
             _wait_for_session_to_end(process.pid)
     result = children.run(arguments)
     assert result.returncode == 0, result.stderr
-    assert killed >= 2
     assert finished(out) == tree(reference)
+
+
+KILLED_AT = """
+import os, signal, sys
+left, sync = int(sys.argv.pop(1)), os.fsync
+def write(descriptor):
+    global left
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    sync(descriptor)
+os.fsync = write
+from synthgen.cli import main
+main()
+"""
 
 
 @pytest.mark.slow
