@@ -12,6 +12,7 @@ import pytest
 from children import run as run_command
 from click.testing import CliRunner
 from evalkit.cli import main as evalkit
+from made_once import made_once
 from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 from posecore.shard import ShardReader
 from refinenet.cli import main as refinenet
@@ -76,27 +77,34 @@ def run(line, folder):
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     done = run_command([sys.executable, "-m", module, *arguments], cwd=folder, env=environment)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done
+    return done.stdout, done.stderr
+
+
+def run_all(made):
+    """The three commands in an empty folder, and beside it what each printed: standard output, then errors."""
+    folder = made / "empty"
+    folder.mkdir()
+    shutil.copy(REPOSITORY / "examples" / "objects" / "tug.ply", folder / "mesh.ply")
+    (folder / "small.yaml").write_text(SMALL)
+    lines = (RENDER.replace("200000", "32") + " --preset small.yaml --workers 1", f"{TRAIN} {SHORT}", REPORT)
+    (made / "printed.json").write_text(json.dumps([run(line, folder) for line in lines]))
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory):
     """The folder after the three commands, and what each printed."""
-    folder = tmp_path_factory.mktemp("empty")
-    shutil.copy(REPOSITORY / "examples" / "objects" / "tug.ply", folder / "mesh.ply")
-    (folder / "small.yaml").write_text(SMALL)
-    rendered = run(RENDER.replace("200000", "32") + " --preset small.yaml --workers 1", folder)
-    return folder, rendered, run(f"{TRAIN} {SHORT}", folder), run(REPORT, folder)
+    made = made_once(tmp_path_factory, "three_commands", run_all)
+    return made / "empty", json.loads((made / "printed.json").read_text())
 
 
 @pytest.mark.slow
 def test_they_end_in_a_report_of_refined_beside_initial_poses(work):
-    folder, rendered, trained, _ = work
-    lines = rendered.stderr.splitlines()
+    folder, ((_, rendered), (trained, _), _) = work
+    lines = rendered.splitlines()
     assert lines[0] == "mesh.ply: diameter 118.9 mm (--units mm)"
     assert lines[1].startswith("shards: 0 of 32 pairs are there")
     assert lines[-2:] == ["shards: complete, 32 pairs, 3 test images", "next: refinenet train shards"]
-    assert trained.stdout.splitlines()[-1] == "next: evalkit report"
+    assert trained.splitlines()[-1] == "next: evalkit report"
     summary = json.loads((folder / "report/summary.json").read_text())
     (compared,) = summary["against_initial"]
     assert (compared["name"], compared["reference"]) == ("compact", "initial")
@@ -128,8 +136,8 @@ def test_initial_poses_are_those_of_evalkit_perturb(work, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_that_is_complete_refines_its_test_images_again(work, monkeypatch):
-    folder = work[0]
+def test_a_resumed_run_that_is_complete_refines_its_test_images_again(work, tmp_path, monkeypatch):
+    folder = shutil.copytree(work[0], tmp_path / "copy")
     monkeypatch.chdir(folder)
     before = (folder / "results/compact.csv").read_text()
     (folder / "results/compact.csv").unlink()

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 from children import run
+from made_once import made_once
 from refinenet.training.loop import train
 
 from .test_training import SMALL, small
@@ -54,7 +55,10 @@ PARTS = [*PRECISE, "on_policy.fraction=0.5", "on_policy.begin=0", "on_policy.ful
 @pytest.fixture(scope="module")
 def trained(dataset, tmp_path_factory):
     """Folder of what two ranks trained: `doubled1` and `doubled2`, `whole`, and the same in `parts`."""
-    folder = tmp_path_factory.mktemp("ranks")
+    return made_once(tmp_path_factory, "ranks", lambda folder: train_several(dataset, folder))
+
+
+def train_several(dataset, folder):
     (folder / "several.py").write_text(SEVERAL)
     doubled = {f"doubled{n}": settings([*DOUBLED, f"optimiser.accumulate={n}"]) for n in (1, 2)}
     whole = settings(PARTS)
@@ -65,7 +69,6 @@ def trained(dataset, tmp_path_factory):
     result = torchrun(folder / "several.py", json.dumps(commands), folder)
     assert result.returncode == 0, result.stderr[-2000:]
     assert result.stdout.count("initial  refined") == len(commands)  # rank 0 alone prints
-    return folder
 
 
 @pytest.mark.parametrize("accumulate", [1, 2])

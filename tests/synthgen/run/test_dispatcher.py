@@ -12,8 +12,11 @@ import dask
 import numpy as np
 import psutil
 import pytest
+from click.testing import CliRunner
 from distributed import Client
+from made_once import made_once
 from posecore.shard import Encoded, ShardReader, ShardWriter, field_table
+from synthgen.cli import main
 from synthgen.run import cluster, dispatcher, worker
 from synthgen.run.shard_job import ShardJob, ShardRenderer
 
@@ -21,13 +24,14 @@ from synthgen.run.shard_job import ShardJob, ShardRenderer
 def command(tug_ply, out, small_set, *extra):
     return [
         *(sys.executable, "-m", "synthgen.cli", "render", "--object", str(tug_ply), "--out", str(out), "--quiet"),
-        *small_set,
+        *("--test-images", "0", *small_set),
         *extra,
     ]
 
 
-def run(*arguments, **settings):
-    return children.run(command(*arguments), **settings)
+def run(*arguments):
+    """The command in this process; its workers are others."""
+    return CliRunner().invoke(main, command(*arguments)[3:])
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -42,10 +46,11 @@ def finished(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory, tug_ply, small_set):
-    out = tmp_path_factory.mktemp("reference") / "shards"
-    result = run(tug_ply, out, small_set, "--n", "22", "--workers", "1")
-    assert result.returncode == 0, result.stderr
-    return out
+    def render(folder):
+        result = run(tug_ply, folder / "shards", small_set, "--n", "22", "--workers", "1")
+        assert result.exit_code == 0, result.output
+
+    return made_once(tmp_path_factory, "dispatched", render) / "shards"
 
 
 @pytest.mark.slow
@@ -62,14 +67,14 @@ def test_the_dataset_is_complete_and_in_scene_order(reference):
 @pytest.mark.slow
 def test_two_workers_make_the_same_bytes(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "22", "--workers", "2")
-    assert result.returncode == 0, result.stderr
+    assert result.exit_code == 0, result.output
     assert tree(tmp_path / "shards") == tree(reference)
 
 
 @pytest.mark.slow
 def test_a_shorter_dataset_starts_with_the_same_samples(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "3", "--workers", "1")
-    assert result.returncode == 0, result.stderr
+    assert result.exit_code == 0, result.output
     short, long = (ShardReader(str(p)).read(0) for p in (tmp_path / "shards", reference))
     for name, values in short.items():
         assert np.array_equal(values, long[name][:3]), name
@@ -86,8 +91,8 @@ def test_killing_it_at_random_writes_changes_no_byte(reference, tmp_path, tug_pl
         with children.started(killed, stderr=subprocess.DEVNULL) as process:
             assert process.wait() == -signal.SIGKILL
             _wait_for_session_to_end(process.pid)
-    result = children.run(arguments)
-    assert result.returncode == 0, result.stderr
+    result = CliRunner().invoke(main, arguments[3:])
+    assert result.exit_code == 0, result.output
     assert finished(out) == tree(reference)
 
 
@@ -143,7 +148,7 @@ def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, sm
         (["--n", "22", "--set", "window.padding=0.4"], "padding"),
     ):
         result = run(tug_ply, reference, small_set, *extra)
-        assert result.returncode == 1
+        assert result.exit_code == 1
         assert named in result.stderr
         diameter, error = result.stderr.splitlines()
         assert error.startswith("Error: ")
@@ -190,7 +195,7 @@ def test_cycles_makes_the_same_bytes_with_one_and_two_workers(tmp_path, tug_ply,
             *(tug_ply, tmp_path / workers, small_set, "--n", "10", "--workers", workers),
             *("--engine", "cycles", "--samples", "2"),
         )
-        assert result.returncode == 0, result.stderr
+        assert result.exit_code == 0, result.output
     assert tree(tmp_path / "1") == tree(tmp_path / "2")
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from children import kill_session, run, started, wait_until
+from children import kill_session, started, wait_until
 from click.testing import CliRunner
 from distributed import Client
 from render_processes import render_command as command
@@ -25,11 +25,16 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def error_line(result):
-    assert result.returncode == 1, result.stderr
-    lines = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    assert len(lines) == 1, result.stderr
-    assert "Traceback" not in result.stderr
+def run(arguments):
+    """The command in this process."""
+    return CliRunner().invoke(main, arguments[3:])
+
+
+def error_line(exit_code, errors):
+    assert exit_code == 1, errors
+    lines = [line for line in errors.splitlines() if line.startswith("Error: ")]
+    assert len(lines) == 1, errors
+    assert "Traceback" not in errors
     return lines[0]
 
 
@@ -69,7 +74,7 @@ def renderers(process):
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_bytes(cluster, tmp_path, tug_ply, small_set):
     undisturbed = run(command(tug_ply, tmp_path / "local", small_set, "--workers", "1", "--test-images", "0"))
-    assert undisturbed.returncode == 0, undisturbed.stderr
+    assert undisturbed.exit_code == 0, undisturbed.output
     first, second = cluster.worker(), cluster.worker()
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, small_set, "--scheduler", cluster.address)
@@ -95,8 +100,7 @@ def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path, tug_ply, smal
         wait_until((out / "manifest.jsonl").exists, driver)
         cluster.scheduler.kill()
         _, errors = driver.communicate()
-    result = subprocess.CompletedProcess(arguments, driver.returncode, "", errors)
-    assert "the scheduler is gone; start it and its workers" in error_line(result)
+    assert "the scheduler is gone; start it and its workers" in error_line(driver.returncode, errors)
 
 
 @pytest.mark.slow
@@ -118,7 +122,7 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
             client.wait_for_workers(1)
         result = run(arguments)
         for word in words:
-            assert word in error_line(result)
+            assert word in error_line(result.exit_code, result.stderr)
         kill_session(process)
 
 
