@@ -3,9 +3,11 @@
 import importlib
 import itertools
 import json
+import runpy
 import shlex
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import click
 import cv2
@@ -147,17 +149,26 @@ def test_a_wrong_line_is_found(tmp_path) -> None:
         check_line(["synthgen", "cut", "--dataset", "a", "--out", "b", "--set", "no_such=1"])
 
 
-@pytest.mark.slow
+def run_script(name: str, *arguments: object) -> None:
+    """Run an experiment's script in this process, as if it were started in a folder of its own."""
+    script = ROOT / "experiments" / f"{name}.py"
+    path = [str(script.parent), *(entry for entry in sys.path if Path(entry).resolve() != ROOT)]
+    with patch.dict(sys.modules), patch.object(sys, "path", path):
+        for module in [module for module in sys.modules if module.partition(".")[0] == "experiments"]:
+            del sys.modules[module]
+        with patch.object(sys, "argv", [str(script), *map(str, arguments)]), pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(script), run_name="__main__")
+    assert not ended.value.code
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_help_and_list_run_nothing(name, inputs, tmp_path) -> None:
-    script = [sys.executable, str(ROOT / "experiments" / f"{name}.py")]
-    shown = run([*script, "--help"])
-    assert shown.returncode == 0, shown.stderr
-    assert experiment(name).doc.splitlines()[0] in shown.stdout and all(f"--{size}" in shown.stdout for size in SIZES)
+def test_help_and_list_run_nothing(name, inputs, tmp_path, capsys) -> None:
+    run_script(name, "--help")
+    shown = capsys.readouterr().out
+    assert experiment(name).doc.splitlines()[0] in shown and all(f"--{size}" in shown for size in SIZES)
     work = tmp_path / "work"
-    listed = run([*script, work, "--smoke", "--list", "--data", inputs.data])
-    assert listed.returncode == 0, listed.stderr
-    lines = [shlex.split(line) for line in listed.stdout.splitlines()]
+    run_script(name, work, "--smoke", "--list", "--data", inputs.data)
+    lines = [shlex.split(line) for line in capsys.readouterr().out.splitlines()]
     assert lines == [
         list(step.command) for step in experiment(name).plan(work, "smoke", common.Inputs(data=inputs.data))
     ]

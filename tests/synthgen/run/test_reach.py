@@ -38,7 +38,7 @@ def listening(pid):
 @contextmanager
 def rendering(tug_ply, out, small_set, *extra):
     """A real render in a process of its own, with its first shard committed; more remain than it can do meanwhile."""
-    arguments = command(tug_ply, out, [*small_set, "--n", "200000"], *extra)
+    arguments = command(tug_ply, out, [*small_set, "--n", "200000", "--test-images", "0"], *extra)
     with started(arguments) as process:
         wait_until((out / "manifest.jsonl").exists, process)
         yield process
