@@ -5,7 +5,9 @@ import itertools
 import json
 import runpy
 import shlex
+import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
 from unittest.mock import patch
 
@@ -13,7 +15,7 @@ import click
 import cv2
 import numpy as np
 import pytest
-from children import run
+from click.testing import CliRunner
 from posecore import config as config_tools
 from posecore import se3
 from posecore.bop import Estimate, load_models_info, read_results, read_sidecar, write_results
@@ -153,12 +155,20 @@ def run_script(name: str, *arguments: object) -> None:
     """Run an experiment's script in this process, as if it were started in a folder of its own."""
     script = ROOT / "experiments" / f"{name}.py"
     path = [str(script.parent), *(entry for entry in sys.path if Path(entry).resolve() != ROOT)]
-    with patch.dict(sys.modules), patch.object(sys, "path", path):
-        for module in [module for module in sys.modules if module.partition(".")[0] == "experiments"]:
-            del sys.modules[module]
-        with patch.object(sys, "argv", [str(script), *map(str, arguments)]), pytest.raises(SystemExit) as ended:
+    argv = [str(script), *map(str, arguments)]
+    before = forget_experiments()
+    try:
+        with patch.object(sys, "path", path), patch.object(sys, "argv", argv), pytest.raises(SystemExit) as ended:
             runpy.run_path(str(script), run_name="__main__")
+    finally:
+        forget_experiments()
+        sys.modules.update(before)
     assert not ended.value.code
+
+
+def forget_experiments() -> dict:
+    """Modules of the experiments, which the next import makes anew."""
+    return {name: sys.modules.pop(name) for name in list(sys.modules) if name.partition(".")[0] == "experiments"}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -200,12 +210,22 @@ def test_a_file_to_work_in_is_refused(tmp_path, monkeypatch) -> None:
     assert file.read_text() == "kept"
 
 
+def in_this_process(command, *, cwd=None, run=subprocess.run, **settings):
+    """As `subprocess.run`, but without a process for a command of the project."""
+    program = Path(command[0]).name
+    if program not in GROUPS:
+        return run(command, cwd=cwd, **settings)
+    module, name = GROUPS[program].split(":")
+    with chdir(cwd or "."):
+        result = CliRunner().invoke(getattr(importlib.import_module(module), name), command[1:])
+    print(result.output)
+    return subprocess.CompletedProcess(command, result.exit_code)
+
+
 @pytest.mark.slow
 def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
-    script = ROOT / "experiments" / "perturbation_curves.py"
-    command = [sys.executable, str(script), str(tmp_path / "work"), "--smoke"]
-    first = run(command)
-    assert first.returncode == 0, first.stdout + first.stderr
+    with patch.object(subprocess, "run", in_this_process):
+        run_script("perturbation_curves", tmp_path / "work", "--smoke")
     result = json.loads((tmp_path / "work" / "result.json").read_text())
     assert (tmp_path / "work" / "report" / "index.html").is_file()
     assert set(result["methods"]) == {"initial", "shipped", "edge-icp"}
