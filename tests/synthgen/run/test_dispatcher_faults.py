@@ -12,11 +12,13 @@ from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import children
 import cloudpickle
 import numpy as np
 import pytest
+from distributed import Client
 from posecore.errors import RenderError
 from posecore.shard import ShardReader, ShardWriter
 from synthgen.engines.blender import scratch
@@ -141,7 +143,7 @@ def test_a_process_that_hangs_with_pythons_lock_held_is_killed():
     assert "Traceback" not in ended.stderr
 
 
-class Noting:
+class Noting(ShardRenderer):
     """Stands for a renderer, and notes under which time limits it works."""
 
     def __init__(self, limits):
@@ -178,8 +180,8 @@ def test_both_tasks_work_within_the_time_limit_of_the_job(monkeypatch, config_of
         task(*arguments)
         return SimpleNamespace(add_done_callback=lambda callback: None)
 
-    client = SimpleNamespace(submit=submit)
-    dispatching = dispatcher.Dispatcher(client, plugin, None, None, shard_timeout_s=7.0)
+    client, writer = Mock(spec=Client, submit=submit), Mock(spec=ShardWriter)
+    dispatching = dispatcher.Dispatcher(client, plugin, writer, lambda encoded: None, shard_timeout_s=7.0)
     for scene in (None, 6):
         dispatching._submit(dispatcher._Shard(id=3), scene)
     assert renderer.noted == [("prepare", 7.0), ("render", 7.0), ("prepare", 7.0), ("scene", 7.0)]
