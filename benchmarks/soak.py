@@ -50,6 +50,7 @@ class Soak:
         self.start_s = 1.0
         self.counts = {"worker_kills": 0, "driver_kills": 0, "rounds": 0}
         self.skipped: list[str] = []
+        self.processes: list[subprocess.Popen[str]] = []
 
     def command(self, folder: Path, objects: list[Path] | None = None, *extra: str) -> list[str]:
         """The command that renders into a folder."""
@@ -62,8 +63,10 @@ class Soak:
         ]
 
     def start(self, folder: Path) -> subprocess.Popen[str]:
-        """Start the command in a session of its own, so that processes that outlive it can be detected."""
-        return subprocess.Popen(self.command(folder), stderr=subprocess.PIPE, text=True, start_new_session=True)
+        """Start the command in a process group of its own, so that processes that outlive it can be detected."""
+        process = subprocess.Popen(self.command(folder), stderr=subprocess.PIPE, text=True, process_group=0)
+        self.processes.append(process)
+        return process
 
     def finish(self, command: list[str], expected: int = 0, message: str = "") -> str:
         """Run a command to its end; its standard error.
@@ -247,9 +250,13 @@ class Soak:
     def run(self) -> dict[str, object]:
         """Run all faults; the facts for the last line."""
         began = time.monotonic()
-        self.undisturbed()
-        for fault in self.arguments.faults:
-            getattr(self, fault)()
+        try:
+            self.undisturbed()
+            for fault in self.arguments.faults:
+                getattr(self, fault)()
+        finally:
+            for process in self.processes:
+                end(process)
         left = [p for p in self.out.rglob("*.tmp")]
         if left:
             raise Fault(f"{left[0]} is left behind")
@@ -269,15 +276,31 @@ def hashes(folder: Path) -> dict[str, str]:
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
-def wait_for_the_end_of(session: int) -> None:
-    """Wait until no process of a session is left: children of a killed command must not outlive it."""
+def end(process: subprocess.Popen[str]) -> None:
+    """Kill a command that still runs, and its children.
+
+    Python's resource tracker is left to end by itself: it removes the semaphores of the killed.
+    """
+    if process.poll() is not None:
+        return
+    for member in psutil.process_iter():
+        try:
+            if os.getpgid(member.pid) == process.pid and "resource_tracker" not in " ".join(member.cmdline()):
+                member.kill()
+        except (psutil.Error, OSError):  # it ended meanwhile
+            pass
+    process.wait()
+
+
+def wait_for_the_end_of(group: int) -> None:
+    """Wait until no process of a group is left: children of a killed command must not outlive it."""
     for _ in range(int(HANG_S / 0.1)):
         try:
-            os.killpg(session, 0)
+            os.killpg(group, 0)
         except ProcessLookupError:
             return
         time.sleep(0.1)
-    os.killpg(session, signal.SIGKILL)
+    os.killpg(group, signal.SIGKILL)
     raise Fault(f"workers outlive the command by {HANG_S:.0f} s")
 
 

@@ -47,10 +47,10 @@ class Size:
 
 FULL = Size(pairs=6000, frames=150, engine="cycles", train="--steps 6000 --threads 1", minutes="about 16 minutes")
 SMOKE = Size(
-    pairs=128,
+    pairs=64,
     frames=3,
     engine="raster",
-    train="--steps 12 --batch 8 --set validation.pairs=16",
+    train="--steps 6 --batch 8 --set validation.pairs=8",
     minutes="about a minute",
 )
 

@@ -1,10 +1,12 @@
-"""What all tests share: one thread per software renderer, and the real data where it is there."""
+"""What all tests share: one thread per renderer and per matrix library, and the real data where it is there."""
 
 import os
 from pathlib import Path
 
-# Before anything opens a GL context: test processes run side by side, and Mesa would start a thread per core in each.
+# Before anything opens a GL context or imports torch: test processes run side by side, and Mesa and OpenMP would start
+# a thread per core in each.
 os.environ.setdefault("LP_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 

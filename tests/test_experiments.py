@@ -3,15 +3,19 @@
 import importlib
 import itertools
 import json
+import runpy
 import shlex
+import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
+from unittest.mock import patch
 
 import click
 import cv2
 import numpy as np
 import pytest
-from children import run
+from click.testing import CliRunner
 from posecore import config as config_tools
 from posecore import se3
 from posecore.bop import Estimate, load_models_info, read_results, read_sidecar, write_results
@@ -147,17 +151,34 @@ def test_a_wrong_line_is_found(tmp_path) -> None:
         check_line(["synthgen", "cut", "--dataset", "a", "--out", "b", "--set", "no_such=1"])
 
 
-@pytest.mark.slow
+def run_script(name: str, *arguments: object) -> None:
+    """Run an experiment's script in this process, as if it were started in a folder of its own."""
+    script = ROOT / "experiments" / f"{name}.py"
+    path = [str(script.parent), *(entry for entry in sys.path if Path(entry).resolve() != ROOT)]
+    argv = [str(script), *map(str, arguments)]
+    before = forget_experiments()
+    try:
+        with patch.object(sys, "path", path), patch.object(sys, "argv", argv), pytest.raises(SystemExit) as ended:
+            runpy.run_path(str(script), run_name="__main__")
+    finally:
+        forget_experiments()
+        sys.modules.update(before)
+    assert not ended.value.code
+
+
+def forget_experiments() -> dict:
+    """Modules of the experiments, which the next import makes anew."""
+    return {name: sys.modules.pop(name) for name in list(sys.modules) if name.partition(".")[0] == "experiments"}
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_help_and_list_run_nothing(name, inputs, tmp_path) -> None:
-    script = [sys.executable, str(ROOT / "experiments" / f"{name}.py")]
-    shown = run([*script, "--help"])
-    assert shown.returncode == 0, shown.stderr
-    assert experiment(name).doc.splitlines()[0] in shown.stdout and all(f"--{size}" in shown.stdout for size in SIZES)
+def test_help_and_list_run_nothing(name, inputs, tmp_path, capsys) -> None:
+    run_script(name, "--help")
+    shown = capsys.readouterr().out
+    assert experiment(name).doc.splitlines()[0] in shown and all(f"--{size}" in shown for size in SIZES)
     work = tmp_path / "work"
-    listed = run([*script, work, "--smoke", "--list", "--data", inputs.data])
-    assert listed.returncode == 0, listed.stderr
-    lines = [shlex.split(line) for line in listed.stdout.splitlines()]
+    run_script(name, work, "--smoke", "--list", "--data", inputs.data)
+    lines = [shlex.split(line) for line in capsys.readouterr().out.splitlines()]
     assert lines == [
         list(step.command) for step in experiment(name).plan(work, "smoke", common.Inputs(data=inputs.data))
     ]
@@ -189,12 +210,22 @@ def test_a_file_to_work_in_is_refused(tmp_path, monkeypatch) -> None:
     assert file.read_text() == "kept"
 
 
+def in_this_process(command, *, cwd=None, run=subprocess.run, **settings):
+    """As `subprocess.run`, but without a process for a command of the project."""
+    program = Path(command[0]).name
+    if program not in GROUPS:
+        return run(command, cwd=cwd, **settings)
+    module, name = GROUPS[program].split(":")
+    with chdir(cwd or "."):
+        result = CliRunner().invoke(getattr(importlib.import_module(module), name), command[1:])
+    print(result.output)
+    return subprocess.CompletedProcess(command, result.exit_code)
+
+
 @pytest.mark.slow
 def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
-    script = ROOT / "experiments" / "perturbation_curves.py"
-    command = [sys.executable, str(script), str(tmp_path / "work"), "--smoke"]
-    first = run(command)
-    assert first.returncode == 0, first.stdout + first.stderr
+    with patch.object(subprocess, "run", in_this_process):
+        run_script("perturbation_curves", tmp_path / "work", "--smoke")
     result = json.loads((tmp_path / "work" / "result.json").read_text())
     assert (tmp_path / "work" / "report" / "index.html").is_file()
     assert set(result["methods"]) == {"initial", "shipped", "edge-icp"}

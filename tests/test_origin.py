@@ -34,6 +34,7 @@ from posecore.shard import ShardReader
 from posecore.symmetry import ContinuousSymmetry
 from refinenet.cli import main as refinenet
 from refinenet.models import checkpoint
+from search_models import models_made_once
 from synthgen.cli import main as synthgen
 from synthgen.engines.make import make_engine
 from synthgen.scene import Light, Material, Pattern, Scene, SceneObject
@@ -44,7 +45,7 @@ GRID_MM = 2.0**-12
 TUG, BOBBIN = 1, 5
 pytestmark = pytest.mark.slow
 CAMERA = Camera(K=intrinsics(500.0, 503.0, 161.5, 118.0), width_px=320, height_px=240)
-FRAMES = 5
+FRAMES = 3
 CHECKPOINTS = Path(__file__).resolve().parents[1] / "examples/checkpoints"
 
 
@@ -91,6 +92,12 @@ def assert_same_poses(plain, other):
 def assert_same_pose(a, b):
     np.testing.assert_allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-6)
     np.testing.assert_allclose(a[:3, 3], b[:3, 3], rtol=0, atol=1e-6 * np.linalg.norm(a[:3, 3]))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _models_made_once():
+    with models_made_once():
+        yield
 
 
 @pytest.fixture(scope="session")

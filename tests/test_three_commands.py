@@ -1,17 +1,18 @@
 """The three commands of the README in an empty folder: as written they need no more, and they end in a report."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
+from contextlib import chdir
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+from children import run as run_command
 from click.testing import CliRunner
 from evalkit.cli import main as evalkit
+from made_once import made_once
 from posecore.bop import BopDataset, read_results, read_sidecar, write_results
 from posecore.shard import ShardReader
 from refinenet.cli import main as refinenet
@@ -73,32 +74,44 @@ def test_as_written_they_lack_no_option_and_a_small_run_differs_in_size_alone(tm
 def run(line, folder):
     program, *arguments = line.split()
     module = {"synthgen": "synthgen.cli", "refinenet": "refinenet", "evalkit": "evalkit.cli"}[program]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-m", module, *arguments], cwd=folder, env=environment, capture_output=True, text=True
-    )
+    done = run_command([sys.executable, "-m", module, *arguments], cwd=folder)
     assert done.returncode == 0, done.stdout + done.stderr
-    return done
+    return done.stdout, done.stderr
+
+
+def run_all(made):
+    """The three commands in an empty folder, then the second one again without its refined poses.
+
+    Beside the folder: those poses, and what each command printed, standard output and errors.
+    """
+    folder = made / "empty"
+    folder.mkdir()
+    shutil.copy(REPOSITORY / "examples" / "objects" / "tug.ply", folder / "mesh.ply")
+    (folder / "small.yaml").write_text(SMALL)
+    lines = (RENDER.replace("200000", "32") + " --preset small.yaml --workers 1", f"{TRAIN} {SHORT}", REPORT)
+    printed = [run(line, folder) for line in lines]
+    (folder / "results/compact.csv").replace(made / "first.csv")
+    with chdir(folder):
+        done = CliRunner().invoke(refinenet, [*f"{TRAIN} {SHORT} --resume --quiet".split()[1:]])
+    assert done.exit_code == 0, done.output
+    (made / "printed.json").write_text(json.dumps([*printed, (done.stdout, done.stderr)]))
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory):
-    """The folder after the three commands, and what each printed."""
-    folder = tmp_path_factory.mktemp("empty")
-    shutil.copy(REPOSITORY / "examples" / "objects" / "tug.ply", folder / "mesh.ply")
-    (folder / "small.yaml").write_text(SMALL)
-    rendered = run(RENDER.replace("200000", "32") + " --preset small.yaml --workers 1", folder)
-    return folder, rendered, run(f"{TRAIN} {SHORT}", folder), run(REPORT, folder)
+    """The folder after the commands, and what each printed."""
+    made = made_once(tmp_path_factory, "three_commands", run_all)
+    return made / "empty", json.loads((made / "printed.json").read_text())
 
 
 @pytest.mark.slow
 def test_they_end_in_a_report_of_refined_beside_initial_poses(work):
-    folder, rendered, trained, _ = work
-    lines = rendered.stderr.splitlines()
+    folder, ((_, rendered), (trained, _), *_) = work
+    lines = rendered.splitlines()
     assert lines[0] == "mesh.ply: diameter 118.9 mm (--units mm)"
     assert lines[1].startswith("shards: 0 of 32 pairs are there")
     assert lines[-2:] == ["shards: complete, 32 pairs, 3 test images", "next: refinenet train shards"]
-    assert trained.stdout.splitlines()[-1] == "next: evalkit report"
+    assert trained.splitlines()[-1] == "next: evalkit report"
     summary = json.loads((folder / "report/summary.json").read_text())
     (compared,) = summary["against_initial"]
     assert (compared["name"], compared["reference"]) == ("compact", "initial")
@@ -130,15 +143,11 @@ def test_initial_poses_are_those_of_evalkit_perturb(work, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_resumed_run_that_is_complete_refines_its_test_images_again(work, monkeypatch):
-    folder = work[0]
-    monkeypatch.chdir(folder)
-    before = (folder / "results/compact.csv").read_text()
-    (folder / "results/compact.csv").unlink()
-    done = CliRunner().invoke(refinenet, [*f"{TRAIN} {SHORT} --resume --quiet".split()[1:]])
-    assert done.exit_code == 0, done.output
-    assert done.stdout.splitlines()[-1] == "next: evalkit report"
-    assert without_times((folder / "results/compact.csv").read_text()) == without_times(before)
+def test_a_resumed_run_that_is_complete_refines_its_test_images_again(work):
+    folder, (*_, (resumed, _)) = work
+    assert resumed.splitlines()[-1] == "next: evalkit report"
+    again, before = (folder / "results/compact.csv"), (folder.parent / "first.csv")
+    assert without_times(again.read_text()) == without_times(before.read_text())
 
 
 def without_times(text):

@@ -247,7 +247,6 @@ def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path, text, line):
             config.apply_overrides({}, [f"x={text.removeprefix('a: ')}"])
 
 
-@pytest.mark.timeout(30)
 def test_a_yaml_that_is_no_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.yaml")
     for file, reason in (

@@ -97,18 +97,22 @@ def test_a_process_that_dies_is_reported():
         pool.submit(os._exit, 1).result()
 
 
-def doubled_later(seconds):
-    time.sleep(seconds)
-    return 2 * seconds
+def named_when_due(path):
+    """A file's name; that of the last one, once it is there."""
+    while path.name == "last" and not path.exists():
+        time.sleep(0.01)
+    return path.name
 
 
 @pytest.mark.slow
-def test_results_come_as_they_finish_each_with_its_task():
+def test_results_come_as_they_finish_each_with_its_task(tmp_path):
     with spawned(2, behave_as_worker, (), "died") as pool:
         assert list(unordered(pool, abs, [], ahead=3)) == []
-        results = list(unordered(pool, doubled_later, (1.0, 0.0, 0.01), ahead=3))
-    assert results[-1] == (1.0, 2.0)
-    assert sorted(results) == [(0.0, 0.0), (0.01, 0.02), (1.0, 2.0)]
+        last, *others = (tmp_path / name for name in ("last", "a", "b"))
+        results = unordered(pool, named_when_due, (last, *others), ahead=3)
+        assert {next(results) for _ in others} == {(path, path.name) for path in others}
+        last.touch()
+        assert list(results) == [(last, "last")]
 
 
 def test_items_are_taken_as_processes_become_free():

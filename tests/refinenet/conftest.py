@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from posecore.window import cut, fixed_side_px, fixed_window
 from refinenet.config import load_config
 from refinenet.models import checkpoint
 from refinenet.models.networks import make_network
+from search_models import models_made_once
 
 K = intrinsics(572.4, 573.6, 325.3, 242.0)
 WIDTH_PX, HEIGHT_PX = 640, 480
@@ -125,6 +126,12 @@ def make_dataset(
             ]
             writer.commit(writer.encode(shard, {key: np.stack([s[key] for s in samples]) for key in samples[0]}))
     return folder
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _models_made_once() -> Iterator[None]:
+    with models_made_once():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,10 @@ import json
 import os
 import shutil
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
+
+from children import started
 
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome")
 FLAGS = (
@@ -25,20 +28,23 @@ class Browser:
     """One tab. Everything that the page logs or asks from elsewhere is kept: `errors` and `requests`."""
 
     def __init__(self, profile: Path):
+        with ExitStack() as opened:
+            self._start(profile, opened)
+            self._opened = opened.pop_all()
+
+    def _start(self, profile, opened):
         down, self._down = (high(end) for end in os.pipe())
         self._up, up = (high(end) for end in os.pipe())
+        for end in (self._down, self._up):
+            opened.callback(os.close, end)
 
         def connect():  # Chromium reads from 3 and writes to 4
             os.dup2(down, 3)
             os.dup2(up, 4)
 
-        self._process = subprocess.Popen(
-            [find_chromium(), *FLAGS, f"--user-data-dir={profile}", "about:blank"],
-            close_fds=False,
-            preexec_fn=connect,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
+        words = [find_chromium(), *FLAGS, f"--user-data-dir={profile}", "about:blank"]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        opened.enter_context(started(words, close_fds=False, preexec_fn=connect, **silent))
         os.close(down)
         os.close(up)
         self._buffer, self._number, self._session = b"", 0, None
@@ -57,10 +63,7 @@ class Browser:
             self._session = None
             self.call("Browser.close")
         finally:
-            self._process.kill()
-            self._process.wait()
-            os.close(self._up)
-            os.close(self._down)
+            self._opened.close()
 
     def call(self, method, **parameters):
         """Ask for something and wait for the answer; events that come meanwhile are noted."""

@@ -5,8 +5,7 @@ import json
 import logging
 import math
 import shutil
-import threading
-import time
+from types import SimpleNamespace
 
 import fsspec
 import numpy as np
@@ -55,6 +54,11 @@ def damaged(dataset, tmp_path):
     content[len(content) // 2] ^= 1
     flipped.write_bytes(content)
     return copy
+
+
+def at_each_look(monkeypatch, happens):
+    """Have something happen each time that a run waits for more of a dataset, in place of the wait."""
+    monkeypatch.setattr("refinenet.data.growing_split.time", SimpleNamespace(sleep=lambda seconds: happens()))
 
 
 def follow(url, out, start=0):
@@ -110,18 +114,16 @@ def test_processes_and_resumed_runs_agree_on_a_growing_dataset(growing, tmp_path
 def test_training_follows_a_dataset_that_is_being_rendered(growing, tmp_path, monkeypatch, caplog):
     url, reveal = growing
     reveal(0)
-    monkeypatch.setattr("refinenet.data.growing_split.POLL_S", 0.05)
+    shards = iter(range(1, 7))
 
-    def render():
-        for n in range(1, 7):
-            time.sleep(0.3)
+    def render(*_):
+        """The next shard, at every look for it and after every step."""
+        if (n := next(shards, None)) is not None:
             reveal(n)
 
-    rendering = threading.Thread(target=render)
-    rendering.start()
+    at_each_look(monkeypatch, render)
     with caplog.at_level(logging.WARNING):
-        train(small("loader.follow=true", "steps=30", "batch=4"), str(url), tmp_path / "run")
-    rendering.join()
+        train(small("loader.follow=true", "steps=30", "batch=4"), str(url), tmp_path / "run", report=render)
     assert "there are 0 of 1 shards to train on, 0 of 1 scene to validate on" in caplog.text
     joined = [json.loads(path.read_text())["shards"] for path in sorted((tmp_path / "run/growth").iterdir())]
     assert any(joined)
@@ -215,14 +217,11 @@ def test_a_resumed_run_measures_what_it_did_before_others_joined(growing, tmp_pa
 @pytest.mark.slow
 def test_training_waits_for_a_dataset_that_is_not_there_yet(growing, tmp_path, monkeypatch, caplog):
     url, reveal = growing
-    monkeypatch.setattr("refinenet.data.growing_split.POLL_S", 0.05)
     reveal(6)
     later = tmp_path / "later"
-    starting = threading.Timer(0.5, lambda: url.rename(later))
-    starting.start()
+    at_each_look(monkeypatch, lambda: url.rename(later))
     with caplog.at_level(logging.WARNING):
         train(small("loader.follow=true", "steps=2", "batch=4"), str(later), tmp_path / "run")
-    starting.join()
     assert f"{later}: no dataset here yet, waiting for one" in caplog.text
 
 
@@ -240,17 +239,13 @@ def test_an_unknown_object_is_not_waited_for(growing, tmp_path):
 def test_training_waits_for_scenes_on_both_sides_and_shards_for_all_loaders(growing, tmp_path, monkeypatch, caplog):
     """Seed 2 draws out scene 6 first, which comes with the second shard; there are two loader processes to feed."""
     url, reveal = growing
-    monkeypatch.setattr("refinenet.data.growing_split.POLL_S", 0.05)
     assert draw_validation_scenes(np.arange(12), 0.1, 2).tolist() == [6]
     reveal(1)
-    later = [threading.Timer(0.4, lambda: reveal(2)), threading.Timer(0.8, lambda: reveal(3))]
-    for timer in later:
-        timer.start()
+    shards = iter((2, 3))
+    at_each_look(monkeypatch, lambda: reveal(next(shards)))
     options = ["loader.follow=true", "validation.scene_fraction=0.1", "seed=2", "loader.workers=3"]
     with caplog.at_level(logging.WARNING):
         run = open_run(small(*options), str(url), tmp_path / "run")
-    for timer in later:
-        timer.join()
     assert "there are 1 of 3 shards to train on, 0 of 1 scene to validate on" in caplog.text
     assert "there are 2 of 3 shards to train on, 1 of 1 scene to validate on" in caplog.text
     assert set(run.data.training.rows) == {0, 1, 2}

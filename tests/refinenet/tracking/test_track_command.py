@@ -235,7 +235,6 @@ def test_ros_stamps_are_frame_numbers_and_longer_digits_are_not(tmp_path):
         assert [number for number, _ in frames] == numbers
 
 
-@pytest.mark.timeout(30)
 def test_a_video_that_is_a_pipe_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe.avi")
     with pytest.raises(DatasetError, match=r"pipe\.avi: cannot be read \(is a pipe, expected a regular file\)"):

@@ -19,8 +19,6 @@ from safetensors.torch import load_file, save_file
 
 from .test_training import small, train
 
-pytestmark = pytest.mark.timeout(300)
-
 
 @pytest.fixture(scope="module")
 def run(dataset, tmp_path_factory):

@@ -7,13 +7,13 @@ import logging
 import math
 import os
 import random
+import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
 import torch
-from children import run, started
+from children import started
 from posecore.errors import CheckpointError, ConfigError, StorageError
 from refinenet.models import checkpoint
 from refinenet.training.loop import train
@@ -124,22 +124,17 @@ def test_what_a_killed_run_left_goes(undisturbed, dataset):
 
 @pytest.mark.slow
 def test_kill_9_at_random_moments_changes_nothing(dataset, tmp_path):
-    """Killed three times somewhere between two checkpoints, its loader process too; then left to end."""
-    options = [*AVERAGED, "steps=30", "checkpoint_every=4", "validation.every=8", "loader.workers=1"]
+    """Killed in a step between two checkpoints, then while a checkpoint is written, its loader process too; then left
+    to end."""
+    options = [*AVERAGED, "steps=16", "checkpoint_every=4", "validation.every=8", "loader.workers=1"]
     train(small(*options), str(dataset), tmp_path / "undisturbed")
-    out, rng, killed = tmp_path / "killed", random.Random(0), 0
-    command = [sys.executable, "-c", RUN, str(dataset), str(out), json.dumps(options)]
-    for first in (1, 7, 15):
-        goal = first + rng.randrange(7)
+    out, rng = tmp_path / "killed", random.Random(0)
+    for moment, count in (("step", 5 + rng.randrange(3)), ("write", 3 + rng.randrange(3))):
+        command = [sys.executable, "-c", RUN, str(dataset), str(out), json.dumps(options), moment, str(count)]
         with started(command, cwd=ROOT) as process:
-            while process.poll() is None and steps_logged(out) < goal:
-                time.sleep(0.005)
-            time.sleep(0.05 * rng.random())
-            assert process.poll() in (None, 0)
-            killed += process.poll() is None
-    assert killed
-    ended = run(command, cwd=ROOT)
-    assert ended.returncode == 0, ended.stderr
+            assert process.wait() == -signal.SIGKILL
+    assert 4 <= steps_logged(out) < 16
+    train(small(*options), str(dataset), out, resume=True)
     for name in ("last.safetensors", "best.safetensors"):
         assert_same_weights(tmp_path / "undisturbed", out, name)
     curves = [[line for line in logged(folder) if "loss_px" in line] for folder in (tmp_path / "undisturbed", out)]
@@ -149,12 +144,29 @@ def test_kill_9_at_random_moments_changes_nothing(dataset, tmp_path):
 
 
 RUN = """
-import json, sys
+import json, os, signal, sys
 from pathlib import Path
 from refinenet.training.loop import train
+from refinenet.training.run import Trainer
 from tests.refinenet.training.test_training import small
+
+def killed(function, left):
+    def counted(*arguments):
+        nonlocal left
+        left -= 1
+        result = function(*arguments)
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+    return counted
+
 if __name__ == "__main__":
     url, out, options = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3])
+    moment, count = sys.argv[4], int(sys.argv[5])
+    if moment == "step":
+        Trainer.take_step = killed(Trainer.take_step, count)
+    else:
+        os.fsync = killed(os.fsync, count)
     train(small(*options), url, out, resume=(out / "last.safetensors").exists())
 """
 

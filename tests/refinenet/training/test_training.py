@@ -181,12 +181,10 @@ def test_the_paper_preset_takes_a_step(mesh, tmp_path):
     loaded = checkpoint.load(tmp_path / "run" / "best.safetensors", "paper")
     assert isinstance(loaded.network(), PaperNet)
     assert errors["validation/add_after_mm"] > 0
+    weights = loaded.network().state_dict()
     begun = load_config("paper", [*options[1:], f"init={loaded.path}"])  # which has a stem already
     trainer = open_run(begun, str(dataset), tmp_path / "begun", resume=False)
-    assert all(
-        torch.equal(value, loaded.network().state_dict()[key])
-        for key, value in trainer.eval_network.state_dict().items()
-    )
+    assert all(torch.equal(value, weights[key]) for key, value in trainer.eval_network.state_dict().items())
     trainer.close()
 
 

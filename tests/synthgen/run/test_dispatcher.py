@@ -12,8 +12,11 @@ import dask
 import numpy as np
 import psutil
 import pytest
+from click.testing import CliRunner
 from distributed import Client
+from made_once import made_once
 from posecore.shard import Encoded, ShardReader, ShardWriter, field_table
+from synthgen.cli import main
 from synthgen.run import cluster, dispatcher, worker
 from synthgen.run.shard_job import ShardJob, ShardRenderer
 
@@ -21,13 +24,14 @@ from synthgen.run.shard_job import ShardJob, ShardRenderer
 def command(tug_ply, out, small_set, *extra):
     return [
         *(sys.executable, "-m", "synthgen.cli", "render", "--object", str(tug_ply), "--out", str(out), "--quiet"),
-        *small_set,
+        *("--test-images", "0", *small_set),
         *extra,
     ]
 
 
-def run(*arguments, **settings):
-    return children.run(command(*arguments), **settings)
+def run(*arguments):
+    """The command in this process; its workers are others."""
+    return CliRunner().invoke(main, command(*arguments)[3:])
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -42,10 +46,11 @@ def finished(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory, tug_ply, small_set):
-    out = tmp_path_factory.mktemp("reference") / "shards"
-    result = run(tug_ply, out, small_set, "--n", "22", "--workers", "1")
-    assert result.returncode == 0, result.stderr
-    return out
+    def render(folder):
+        result = run(tug_ply, folder / "shards", small_set, "--n", "22", "--workers", "1")
+        assert result.exit_code == 0, result.output
+
+    return made_once(tmp_path_factory, "dispatched", render) / "shards"
 
 
 @pytest.mark.slow
@@ -62,41 +67,48 @@ def test_the_dataset_is_complete_and_in_scene_order(reference):
 @pytest.mark.slow
 def test_two_workers_make_the_same_bytes(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "22", "--workers", "2")
-    assert result.returncode == 0, result.stderr
+    assert result.exit_code == 0, result.output
     assert tree(tmp_path / "shards") == tree(reference)
 
 
 @pytest.mark.slow
 def test_a_shorter_dataset_starts_with_the_same_samples(reference, tmp_path, tug_ply, small_set):
     result = run(tug_ply, tmp_path / "shards", small_set, "--n", "3", "--workers", "1")
-    assert result.returncode == 0, result.stderr
+    assert result.exit_code == 0, result.output
     short, long = (ShardReader(str(p)).read(0) for p in (tmp_path / "shards", reference))
     for name, values in short.items():
         assert np.array_equal(values, long[name][:3]), name
 
 
 @pytest.mark.slow
-def test_killing_it_at_random_moments_changes_no_byte(reference, tmp_path, tug_ply, small_set):
+def test_killing_it_at_random_writes_changes_no_byte(reference, tmp_path, tug_ply, small_set):
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, small_set, "--n", "22", "--workers", "2")
-    rng = np.random.default_rng(1)
-    killed = 0
-    for _ in range(8):
+    rng, before = np.random.default_rng(1), len(field_table())  # writes of a shard; six are to be written
+    for writes in (rng.integers(before), before + rng.integers(before)):
         # its own session, so that the test can see whether workers outlive a killed parent
-        with children.started(arguments, stderr=subprocess.DEVNULL) as process:
-            while process.poll() is None and not list(out.glob("scene_rgb/c/*")):
-                time.sleep(0.02)
-            time.sleep(rng.uniform(0.0, 0.4))
-            if process.poll() is not None:
-                break
-            process.kill()
-            process.wait()
-            killed += 1
+        killed = [sys.executable, "-c", KILLED_AT, str(writes), *arguments[3:]]
+        with children.started(killed, stderr=subprocess.DEVNULL) as process:
+            assert process.wait() == -signal.SIGKILL
             _wait_for_session_to_end(process.pid)
-    result = children.run(arguments)
-    assert result.returncode == 0, result.stderr
-    assert killed >= 2
+    result = CliRunner().invoke(main, arguments[3:])
+    assert result.exit_code == 0, result.output
     assert finished(out) == tree(reference)
+
+
+KILLED_AT = """
+import os, signal, sys
+left, sync = int(sys.argv.pop(1)), os.fsync
+def write(descriptor):
+    global left
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    left -= 1
+    sync(descriptor)
+os.fsync = write
+from synthgen.cli import main
+main()
+"""
 
 
 @pytest.mark.slow
@@ -136,7 +148,7 @@ def test_another_dataset_in_the_folder_is_refused_by_name(reference, tug_ply, sm
         (["--n", "22", "--set", "window.padding=0.4"], "padding"),
     ):
         result = run(tug_ply, reference, small_set, *extra)
-        assert result.returncode == 1
+        assert result.exit_code == 1
         assert named in result.stderr
         diameter, error = result.stderr.splitlines()
         assert error.startswith("Error: ")
@@ -183,7 +195,7 @@ def test_cycles_makes_the_same_bytes_with_one_and_two_workers(tmp_path, tug_ply,
             *(tug_ply, tmp_path / workers, small_set, "--n", "10", "--workers", workers),
             *("--engine", "cycles", "--samples", "2"),
         )
-        assert result.returncode == 0, result.stderr
+        assert result.exit_code == 0, result.output
     assert tree(tmp_path / "1") == tree(tmp_path / "2")
 
 

@@ -4,15 +4,15 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import psutil
 import pytest
-from children import run, started, wait_until
+from children import kill_session, started, wait_until
 from click.testing import CliRunner
 from distributed import Client
-from render_processes import kill
 from render_processes import render_command as command
 from synthgen.cli import main
 from synthgen.inputs.assets import Assets
@@ -25,51 +25,45 @@ def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def error_line(result):
-    assert result.returncode == 1, result.stderr
-    lines = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
-    assert len(lines) == 1, result.stderr
-    assert "Traceback" not in result.stderr
+def run(arguments):
+    """The command in this process."""
+    return CliRunner().invoke(main, arguments[3:])
+
+
+def error_line(exit_code, errors):
+    assert exit_code == 1, errors
+    lines = [line for line in errors.splitlines() if line.startswith("Error: ")]
+    assert len(lines) == 1, errors
+    assert "Traceback" not in errors
     return lines[0]
 
 
 class Cluster:
     """A scheduler and workers, as `dask scheduler` and `dask worker` start them."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, processes: ExitStack) -> None:
         self.file = folder / "scheduler.json"
-        self.processes: list[subprocess.Popen] = []
-        self.start("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1")
+        self.processes = processes
+        self.scheduler = self.start("scheduler", "--port", "0", "--no-dashboard", "--host", "127.0.0.1")
         self.address = self.wait_for_address()
 
     def start(self, kind, *arguments, **environment):
-        process = subprocess.Popen(
-            [sys.executable, "-m", "dask", kind, "--scheduler-file", str(self.file), *arguments],
-            env={**os.environ, **environment},
-            stderr=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-        )
-        self.processes.append(process)
-        return process
+        command = [sys.executable, "-m", "dask", kind, "--scheduler-file", self.file, *arguments]
+        silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        return self.processes.enter_context(started(command, env={**os.environ, **environment}, **silent))
 
     def worker(self, *arguments, **environment):
         return self.start("worker", "--no-dashboard", *(arguments or ("--nthreads", "1")), **environment)
 
     def wait_for_address(self):
-        return json.loads(wait_until(lambda: self.file.exists() and self.file.read_text(), self.processes[0]))[
-            "address"
-        ]
-
-    def close(self):
-        for process in self.processes:
-            kill(process)
+        text = wait_until(lambda: self.file.exists() and self.file.read_text(), self.scheduler)
+        return json.loads(text)["address"]
 
 
 @pytest.fixture
 def cluster(tmp_path):
-    made = Cluster(tmp_path)
-    yield made
-    made.close()
+    with ExitStack() as processes:
+        yield Cluster(tmp_path, processes)
 
 
 def renderers(process):
@@ -80,7 +74,7 @@ def renderers(process):
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker_makes_the_same_bytes(cluster, tmp_path, tug_ply, small_set):
     undisturbed = run(command(tug_ply, tmp_path / "local", small_set, "--workers", "1", "--test-images", "0"))
-    assert undisturbed.returncode == 0, undisturbed.stderr
+    assert undisturbed.exit_code == 0, undisturbed.output
     first, second = cluster.worker(), cluster.worker()
     out = tmp_path / "shards"
     arguments = command(tug_ply, out, small_set, "--scheduler", cluster.address)
@@ -104,10 +98,9 @@ def test_a_scheduler_that_goes_away_is_one_line(cluster, tmp_path, tug_ply, smal
     arguments = command(tug_ply, out, [*small_set, "--n", "900"], "--scheduler", cluster.address)
     with started(arguments, stderr=subprocess.PIPE) as driver:
         wait_until((out / "manifest.jsonl").exists, driver)
-        cluster.processes[0].kill()
+        cluster.scheduler.kill()
         _, errors = driver.communicate()
-    result = subprocess.CompletedProcess(arguments, driver.returncode, "", errors)
-    assert "the scheduler is gone; start it and its workers" in error_line(result)
+    assert "the scheduler is gone; start it and its workers" in error_line(driver.returncode, errors)
 
 
 @pytest.mark.slow
@@ -129,8 +122,8 @@ def test_workers_without_synthgen_or_with_another_version_are_named(cluster, tmp
             client.wait_for_workers(1)
         result = run(arguments)
         for word in words:
-            assert word in error_line(result)
-        kill(process)
+            assert word in error_line(result.exit_code, result.stderr)
+        kill_session(process)
 
 
 def test_a_worker_says_why_it_cannot_render(tug, config_of):

@@ -9,20 +9,23 @@ import os
 import signal
 import sys
 from collections import Counter
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import children
 import cloudpickle
 import numpy as np
 import pytest
+from distributed import Client
 from posecore.errors import RenderError
 from posecore.shard import ShardReader, ShardWriter
 from synthgen.engines.blender import scratch
 from synthgen.inputs.assets import Assets
 from synthgen.pairs import data_card
 from synthgen.pairs.pair_maker import concatenate
-from synthgen.run import dispatcher
+from synthgen.run import dispatcher, worker
 from synthgen.run.shard_job import REPLACEMENT_ATTEMPT, ShardJob, ShardRenderer
 from synthgen.run.worker import RendererPlugin
 
@@ -62,6 +65,7 @@ HANGS = """
 import ctypes
 from synthgen.run.worker import _killed_after
 with _killed_after(0.2):
+    print("begun", flush=True)
     ctypes.PyDLL(None).pause()
 """
 
@@ -134,7 +138,53 @@ def test_scenes_that_crash_fail_or_hang_are_replaced_and_said(job_and_writer, mo
 
 
 def test_a_process_that_hangs_with_pythons_lock_held_is_killed():
-    assert children.run([sys.executable, "-c", HANGS]).returncode == 1
+    ended = children.run([sys.executable, "-c", HANGS])
+    assert (ended.returncode, ended.stdout) == (1, "begun\n")
+    assert "Traceback" not in ended.stderr
+
+
+class Noting(ShardRenderer):
+    """Stands for a renderer, and notes under which time limits it works."""
+
+    def __init__(self, limits):
+        self.limits, self.noted = limits, []
+
+    def prepare(self):
+        self.noted.append(("prepare", *self.limits))
+
+    def render(self, shard_id, quarantined):
+        self.noted.append(("render", *self.limits))
+
+    def scene(self, shard_id, scene, quarantined):
+        self.noted.append(("scene", *self.limits))
+
+
+def test_both_tasks_work_within_the_time_limit_of_the_job(monkeypatch, config_of, tmp_path):
+    limits = []
+
+    @contextmanager
+    def noted_limit(timeout_s):
+        limits.append(timeout_s)
+        yield
+        limits.pop()
+
+    plugin = RendererPlugin(ShardJob(config=config_of(), card={}, meshes={}))
+    plugin.renderer = renderer = Noting(limits)
+    memory = SimpleNamespace(memory_limit=None)
+    here = SimpleNamespace(plugins={plugin.name: plugin}, memory_manager=memory, nanny=None)
+    monkeypatch.setattr(worker, "get_worker", lambda: here)
+    monkeypatch.setattr(worker, "Event", lambda mark: SimpleNamespace(set=lambda: None))
+    monkeypatch.setattr(worker, "_killed_after", noted_limit)
+
+    def submit(task, *arguments, **settings):
+        task(*arguments)
+        return SimpleNamespace(add_done_callback=lambda callback: None)
+
+    client, writer = Mock(spec=Client, submit=submit), Mock(spec=ShardWriter)
+    dispatching = dispatcher.Dispatcher(client, plugin, writer, lambda encoded: None, shard_timeout_s=7.0)
+    for scene in (None, 6):
+        dispatching._submit(dispatcher._Shard(id=3), scene)
+    assert renderer.noted == [("prepare", 7.0), ("render", 7.0), ("prepare", 7.0), ("scene", 7.0)]
 
 
 @pytest.mark.slow

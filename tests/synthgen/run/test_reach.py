@@ -6,22 +6,22 @@ import socket
 import ssl
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
+from children import started, wait_until
 from click.testing import CliRunner
 from distributed import Client
 from distributed.security import Security
 from posecore.errors import ConfigError
-from render_processes import kill
 from render_processes import render_command as command
 from synthgen.cli import main
 from synthgen.run import cluster as dask_cluster
 
 LOOPBACK = {"127.0.0.1", "::1"}
+LONG_S = 1800  # only against hanging
 
 
 def listening(pid):
@@ -38,20 +38,15 @@ def listening(pid):
 @contextmanager
 def rendering(tug_ply, out, small_set, *extra):
     """A real render in a process of its own, with its first shard committed; more remain than it can do meanwhile."""
-    arguments = command(tug_ply, out, [*small_set, "--n", "200000"], *extra)
-    process = subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True)
-    try:
-        while not (out / "manifest.jsonl").exists():
-            assert process.poll() is None, process.stderr.read()
-            time.sleep(0.05)
+    arguments = command(tug_ply, out, [*small_set, "--n", "200000", "--test-images", "0"], *extra)
+    with started(arguments) as process:
+        wait_until((out / "manifest.jsonl").exists, process)
         yield process
-    finally:
-        kill(process)
 
 
 def greeting(host, port, security=None):
     """First bytes of a dask process to a new connection, which it sends to whom it lets in."""
-    with socket.create_connection((host, port), 30) as plain:
+    with socket.create_connection((host, port), LONG_S) as plain:
         if security is None:
             plain.sendall(bytes(64))
             return plain.recv(1)
@@ -90,7 +85,7 @@ def test_a_render_listens_on_loopback_only_and_runs_no_strangers_code(tmp_path, 
 def http(host, port, page="/json/identity.json"):
     """Answer to a request, for the page that lists a scheduler's workers; none from a port of dask's protocol."""
     try:
-        with socket.create_connection((host, port), 30) as plain:
+        with socket.create_connection((host, port), LONG_S) as plain:
             plain.sendall(f"GET {page} HTTP/1.1\r\nHost: a\r\nConnection: close\r\n\r\n".encode())
             return plain.recv(4096)
     except ConnectionError:
@@ -106,7 +101,7 @@ def test_the_credential_lets_in_and_another_one_does_not():
         assert greeting(host, port, security)
         assert is_refused(host, port, Security.temporary())
         assert is_refused(host, port)
-        with Client(address, security=security, timeout=60) as second:
+        with Client(address, security=security, timeout=LONG_S) as second:
             assert second.run(os.getpid)
 
 
@@ -151,17 +146,10 @@ def encrypted(tmp_path):
     start = [sys.executable, "-m", "dask"]
     silent = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     scheduler = [*start, "scheduler", "--protocol", "tls", "--host", "127.0.0.1", "--port", "0", *tls]
-    processes = [subprocess.Popen([*scheduler, "--scheduler-file", str(file)], **silent)]
-    try:
-        while not (file.exists() and file.read_text()):
-            assert processes[0].poll() is None
-            time.sleep(0.05)
-        address = json.loads(file.read_text())["address"]
-        processes.append(subprocess.Popen([*start, "worker", address, "--nthreads", "1", *tls], **silent))
-        yield address, ca, pem
-    finally:
-        for process in processes:
-            kill(process)
+    with started([*scheduler, "--scheduler-file", file], **silent) as process:
+        address = json.loads(wait_until(lambda: file.exists() and file.read_text(), process))["address"]
+        with started([*start, "worker", address, "--nthreads", "1", *tls], **silent):
+            yield address, ca, pem
 
 
 @pytest.mark.slow
@@ -170,8 +158,8 @@ def test_a_cluster_with_certificates_renders_and_refuses_others(encrypted, tmp_p
     assert address.startswith("tls://")
     out, tls = tmp_path / "shards", ("--tls-ca", str(ca), "--tls-cert", str(pem))
     arguments = command(tug_ply, out, small_set, "--scheduler", address, *tls)
-    rendered = subprocess.run(arguments, capture_output=True, text=True, check=False)
-    assert rendered.returncode == 0, rendered.stderr
+    rendered = CliRunner().invoke(main, arguments[3:])
+    assert rendered.exit_code == 0, rendered.output
     assert (out / "manifest.jsonl").read_text().count("\n") == 12
     other = tmp_path / "other"
     other.mkdir()
