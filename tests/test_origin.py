@@ -362,7 +362,19 @@ def pairs(copies, tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("pairs")
     for root in copies.roots:
         mesh = root / f"models/obj_{TUG:06d}.ply"
-        command = ("render", "--object", mesh, "--n", 32, "--out", folder / root.name, "--engine", "raster")
+        command = (
+            "render",
+            "--object",
+            mesh,
+            "--n",
+            32,
+            "--test-images",
+            0,
+            "--out",
+            folder / root.name,
+            "--engine",
+            "raster",
+        )
         run(synthgen, *command, "--workers", 1, "--quiet", *SMALL)
     return folder / "plain", folder / "shifted"
 

@@ -85,7 +85,7 @@ def strongest_gradient(values, half_strength2, out):
 def lightness_gradient(values, half_strength2, out):
     """Loop of `directions`; `out` has cosine and sine of each cell of two pixels."""
     b, _, p, q = values.shape
-    one, two, three, four = np.float32(1.0), np.float32(2.0), np.float32(3.0), np.float32(4.0)
+    unit, two, three, four = np.float32(1.0), np.float32(2.0), np.float32(3.0), np.float32(4.0)
     grey = np.empty((p + 2, q + 2), np.float32)
     x, y = np.empty((2, q), np.float32), np.empty((2, q), np.float32)
     for i in range(b):
@@ -101,7 +101,7 @@ def lightness_gradient(values, half_strength2, out):
                 dx = (across + (below[u + 2] - below[u])) / four
                 down = (below[u] - above[u]) + two * (below[u + 1] - above[u + 1])
                 dy = (down + (below[u + 2] - above[u + 2])) / four
-                weight = one / np.sqrt(dx * dx + dy * dy + half_strength2)
+                weight = unit / np.sqrt(dx * dx + dy * dy + half_strength2)
                 x[v % 2, u], y[v % 2, u] = dx * weight, dy * weight
             if v % 2:
                 for u in range(q // 2):
