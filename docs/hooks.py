@@ -191,7 +191,7 @@ def data_format_page() -> str:
         "`numcodecs.delta`, which zarr-python brings along: "
         "`zarr.open_group(url)` reads every array as it is stored, with unit, scale and squared in its attributes. "
         "`depth_step_m` stands in the data card: 0.1 mm, doubled as often as the deepest scene of a very large object "
-        "needs, halved until an object under 2 cm is 200 steps wide.",
+        "needs, halved until an object under 2 cm is 200 steps wide, as long as 16 bits reach the deepest scene.",
         "",
         "## The data card",
         "",

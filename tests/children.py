@@ -59,7 +59,7 @@ def kill_session(child: subprocess.Popen[str]) -> None:
     while members := session(child.pid):
         for process in members:
             with suppress(psutil.Error):
-                if not is_tracker(process):
+                if process.pid == child.pid or not (is_tracker(process) or is_copy(process)):
                     process.kill()
         child.poll()
         time.sleep(POLL_S)
@@ -77,6 +77,15 @@ def session(leader: int) -> list[psutil.Process]:
             if os.getsid(process.pid) == leader and process.status() != psutil.STATUS_ZOMBIE:
                 found.append(process)
     return found
+
+
+def is_copy(process: psutil.Process) -> bool:
+    """Whether a process has its parent's command line: it may be a tracker that is about to start.
+
+    Others are killed once their parent is dead.
+    """
+    parent = process.parent()
+    return parent is not None and parent.status() != psutil.STATUS_ZOMBIE and parent.cmdline() == process.cmdline()
 
 
 def is_tracker(process: psutil.Process) -> bool:

@@ -163,7 +163,7 @@ def test_curves_by_level(work):
     ("arguments", "code", "message"),
     [
         (["report", "--dataset", "nowhere", "--results", "results/quick.csv"], 1, "nowhere: no such folder"),
-        (["report", "--results", "absent.csv"], 2, "absent.csv: no sidecar names the dataset"),
+        (["report", "--results", "absent.csv"], 2, "absent.csv: no such file; give a BOP result file"),
         (["report", "--dataset", "test_bop", "--results", "absent.csv"], 1, "absent.csv: cannot be read"),
         (
             ["report", "--dataset", "test_bop", "--results", "results/quick.csv", "--results", "results/quick.csv"],

@@ -256,7 +256,7 @@ def test_the_network_sees_the_pose_it_refines(mesh, trained, frame):
         refiner._network.register_forward_hook(lambda _, inputs, __: seen.append(inputs[0]))
         refiner.refine_batch(Frame(image=image, K=K), requests_of(truths))
     pair = NetworkInput(
-        *(torch.cat(tensors) for tensors in zip(*(one[:4] for one in seen[: len(truths)]), strict=True))
+        *(torch.cat(tensors)[: len(truths)] for tensors in zip(*(one[:4] for one in seen), strict=True))
     )
     render = pair.hypothesis_rgb.float()
     inside = render.sum(dim=1, keepdim=True) > 0

@@ -15,6 +15,7 @@ from posecore.errors import CheckpointError, ConfigError
 from posecore.mesh import Mesh
 
 from refinenet.batch import NetworkInput
+from refinenet.config.network import NetworkKind
 from refinenet.device import choose_device
 from refinenet.errors import RefinementError
 from refinenet.geometry.pivots import PivotFrames
@@ -29,6 +30,9 @@ from refinenet.refiner import Frame, Refinement, Request, ScoreKind, Status, req
 Scorer = Literal["gradient", "learned"]
 STOP_ANGLE_DEG = 1.5
 STOP_DISTANCE_M = 7.5e-3
+POSES_IN_PASS: dict[NetworkKind, int] = {"paper": 1, "compact": 4, "plus": 4, "flow": 1}
+"""Poses of each forward pass on a CPU, which rounds a network's sums by the size of the batch: with another size for the
+last poses a result would depend on the others. Those of the small networks share what a pass costs."""
 
 log = logging.getLogger(__name__)
 
@@ -57,8 +61,7 @@ class Refiner:
         iterations: Largest number of updates of a pose; an update under 1.5 deg and 7.5 mm is the last.
         device: `auto`, `cpu` or `cuda`.
         batch: Largest number of poses rendered together, on a GPU also in a forward pass, where it is halved, with a
-            warning, if the memory is too small. A forward pass on a CPU is of one pose: sums of a network are rounded
-            by the size of its batch, and a pose's result must not depend on the others.
+            warning, if the memory is too small. A forward pass on a CPU has `POSES_IN_PASS` poses.
         allow_other_mesh: Accept a mesh of the trained object's size that is not the trained one.
         min_confidence: Least confidence of a refined pose; a less confident one fails.
 
@@ -103,7 +106,8 @@ class Refiner:
         self._network = loaded.network().to(self.device)
         self._uses_depth = loaded.provenance.config.network.uses_depth
         self._batch = batch
-        self._pass = 1 if self.device.type == "cpu" else batch  # poses in a forward pass
+        kind = loaded.provenance.config.network.kind
+        self._pass = POSES_IN_PASS[kind] if self.device.type == "cpu" else batch  # poses in a forward pass
         self.patch_renderer = PatchRenderer(self.frames.meshes, loaded.provenance)
         self.scorer: Scorer = "learned" if self.predict(*_blank(loaded)).confidence is not None else "gradient"
 
@@ -307,17 +311,20 @@ class Refiner:
         )
 
     def _forward(self, patches: Patches, T: Float[np.ndarray, "s 4 4"], first: int) -> PoseUpdate:
-        part = slice(first, first + self._pass)
+        count = min(self._pass, len(T) - first)
+        rows = np.arange(first, first + (self._pass if self.device.type == "cpu" else count))
+        rows = np.minimum(rows, len(T) - 1)  # the last pose fills the pass up
         inputs = NetworkInput(
-            scene_rgb=self._tensor(patches.scene_rgb[part].transpose(0, 3, 1, 2)),
-            hypothesis_rgb=self._tensor(patches.hypothesis_rgb[part].transpose(0, 3, 1, 2)),
-            T_cam_obj=self._tensor(T[part].astype(np.float32)),
-            K_crop=self._tensor(patches.K_crop[part].astype(np.float32)),
-            hypothesis_depth_m=self._tensor(patches.depth_m[part]) if self._uses_depth else None,
+            scene_rgb=self._tensor(patches.scene_rgb[rows].transpose(0, 3, 1, 2)),
+            hypothesis_rgb=self._tensor(patches.hypothesis_rgb[rows].transpose(0, 3, 1, 2)),
+            T_cam_obj=self._tensor(T[rows].astype(np.float32)),
+            K_crop=self._tensor(patches.K_crop[rows].astype(np.float32)),
+            hypothesis_depth_m=self._tensor(patches.depth_m[rows]) if self._uses_depth else None,
         )
         with torch.inference_mode():
             update: PoseUpdate = self._network(inputs)
-        return update
+        confidence = update.confidence
+        return PoseUpdate(update.dR[:count], update.dt[:count], None if confidence is None else confidence[:count])
 
     def _tensor(self, values: np.ndarray) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(values)).to(self.device)
