@@ -232,7 +232,8 @@ def test_perturbation_curves_end_in_a_report_and_a_result(tmp_path) -> None:
     assert result["methods"]["initial"]["vss_mean"] < result["methods"]["shipped"]["vss_mean"]
     levels = [point["level"] for point in result["curves"]["shipped"]["angle"]]
     assert levels[-1] == 45
-    assert all(step["seconds"] > 0 for step in result["steps"])
+    assert len(result["steps"]) == 6
+    assert all(step["seconds"] >= 0 for step in result["steps"])  # rounded to tenths
 
 
 def test_every_method_starts_from_the_same_poses_and_is_in_the_report(tmp_path) -> None:

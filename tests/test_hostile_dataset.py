@@ -210,7 +210,10 @@ def test_a_sample_that_cannot_be_used_is_named(shards, tmp_path, name, field, ch
         values[field][1] = change(values[field][1])
     writer = ShardWriter(str(shards), reader.card)
     writer.commit(writer.encode(1, values))
-    error = error_of(*commands(shards, tmp_path)[name])
+    program, arguments = commands(shards, tmp_path)[name]
+    if name == "train" and words != SAMPLES[0][2]:  # a process of its own loads the first
+        arguments = [*arguments, "--workers", "0"]
+    error = error_of(program, arguments)
     assert f"Error: {shards}: shard 1, sample 3: " in error
     assert words in error
 
