@@ -182,3 +182,16 @@ def test_items_that_kill_every_process_end_the_run(tmp_path):
 def test_an_error_of_the_job_is_raised_itself():
     with pytest.raises(TypeError, match="has no len"):
         list(map_unordered(len, ("ab", 5), 1, died=str, attempts=3))
+
+
+def math_threads(_):
+    return [os.environ.get(name) for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")]
+
+
+def test_pool_processes_have_one_math_thread_unless_the_environment_says_otherwise(monkeypatch):
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MKL_NUM_THREADS", "3")
+    with spawned(1, behave_as_worker, (), "died") as pool:
+        assert pool.submit(math_threads, 0).result() == ["1", "1", "3"]
+    assert math_threads(0) == [None, None, "3"]

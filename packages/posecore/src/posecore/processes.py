@@ -20,6 +20,8 @@ from posecore.errors import RenderError
 T, R = TypeVar("T"), TypeVar("R")
 _PR_SET_PDEATHSIG = 1
 
+_MATH_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
 
 @contextmanager
 def interrupts_ignored() -> Iterator[None]:
@@ -62,6 +64,22 @@ def interrupts_deferred() -> Iterator[None]:
             signal.raise_signal(received[0])
 
 
+@contextmanager
+def one_math_thread() -> Iterator[None]:
+    """Processes that start in the block have one thread in NumPy's matrix products, unless the environment has others.
+
+    OpenBLAS starts a thread for every core, and each waits for the next product in a busy loop. The number is read when
+    the library is loaded.
+    """
+    added = [name for name in _MATH_THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
+    try:
+        yield
+    finally:
+        for name in added:
+            del os.environ[name]
+
+
 def die_with_parent() -> None:
     """Have the kernel kill this process when its parent exits, also by `kill -9` and while this process hangs.
 
@@ -102,7 +120,7 @@ def spawned(
         pool = ProcessPoolExecutor(workers, mp_context=spawn, initializer=start, initargs=arguments)
     with pool:
         try:
-            with interrupts_deferred():
+            with interrupts_deferred(), one_math_thread():
                 for _ in range(workers):
                     pool.submit(os.getpid)  # starts one
             yield pool

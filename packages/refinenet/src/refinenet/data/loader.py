@@ -13,7 +13,7 @@ from typing import Any
 import cv2
 import torch
 from posecore.errors import PoseError
-from posecore.processes import interrupts_ignored
+from posecore.processes import interrupts_ignored, one_math_thread
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
 from refinenet.batch import Batch
@@ -25,7 +25,10 @@ SHARED_MEMORY = Path("/dev/shm")
 
 
 def prepare_worker(threads: int = 1) -> None:
-    """Limit a loader process to its own core: software rasteriser, OpenCV and torch each start a thread per core."""
+    """Limit a loader process to its own core: software rasteriser, OpenCV and torch each start a thread per core.
+
+    `one_math_thread` at its start does the same for NumPy.
+    """
     os.environ["LP_NUM_THREADS"] = str(threads)
     cv2.setNumThreads(threads)
     torch.set_num_threads(threads)
@@ -104,7 +107,7 @@ class _Loader(DataLoader[Batch]):
 
     def __iter__(self) -> Any:
         try:
-            with interrupts_ignored():
+            with interrupts_ignored(), one_math_thread():
                 batches = super().__iter__()
             yield from batches
         except PoseError as error:

@@ -31,8 +31,8 @@ Scorer = Literal["gradient", "learned"]
 STOP_ANGLE_DEG = 1.5
 STOP_DISTANCE_M = 7.5e-3
 POSES_IN_PASS: dict[NetworkKind, int] = {"paper": 1, "compact": 4, "plus": 4, "flow": 1}
-"""Poses of each forward pass on a CPU, which rounds a network's sums by the size of the batch: with another size for the
-last poses a result would depend on the others. Those of the small networks share what a pass costs."""
+"""Poses of each forward pass on a CPU, which rounds a network's sums by the size of the batch: with another size for
+the last poses a result would depend on the others. Those of the small networks share what a pass costs."""
 
 log = logging.getLogger(__name__)
 
