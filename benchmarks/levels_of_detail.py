@@ -1,9 +1,10 @@
 """What levels of detail save and change: `python benchmarks/levels_of_detail.py --object ../shared/data/lmo/models`.
 
 Scenes of the preset `default` with the rasteriser, objects as occluders too, once with every face and once with levels,
-in turn in one process on one core: processor time of a scene, and what differs between the pairs. `--sphere` times
-loading: reading, diameter and levels of a sphere of so many subdivisions (9 are 5.2 million faces), and of `--mesh`.
-The last line is JSON.
+in turn in one process on one core: processor time of a scene, and what differs between the pairs. Loading (reading,
+diameter, levels) is timed of `--sphere`, an icosphere of so many subdivisions, of `--ball`, a bumpy ball of so many
+rows with all its meridians' vertices at each pole (1000 rows: two million faces), and of `--mesh`; the peak of memory
+is that of the process so far. The last line is JSON.
 """
 
 import argparse
@@ -40,6 +41,7 @@ def main() -> None:
     parser.add_argument("--hypotheses", type=int, action="append", help="hypotheses a scene, 1 and 8 by default")
     parser.add_argument("--scenes", type=int, default=40)
     parser.add_argument("--sphere", type=int, action="append", default=[], metavar="SUBDIVISIONS")
+    parser.add_argument("--ball", type=int, action="append", default=[], metavar="ROWS")
     parser.add_argument("--mesh", type=Path, action="append", default=[], help="mesh file that is loaded; repeatable")
     arguments = parser.parse_args()
     limit_threads(1)
@@ -50,6 +52,7 @@ def main() -> None:
             result[f"{hypotheses} a scene"] = scenes(sources, hypotheses, arguments.scenes)
     with tempfile.TemporaryDirectory() as folder:
         files = [sphere(Path(folder), subdivisions) for subdivisions in arguments.sphere]
+        files += [ball(Path(folder), rows) for rows in arguments.ball]
         for file in (*files, *arguments.mesh):
             result[file.name] = loading(file)
     print(json.dumps(result))
@@ -102,6 +105,22 @@ def sphere(folder: Path, subdivisions: int) -> Path:
     """A sphere of 100 mm; every vertex is on the hull."""
     file = folder / f"sphere{subdivisions}.ply"
     trimesh.creation.icosphere(subdivisions=subdivisions, radius=50.0).export(file)
+    return file
+
+
+def ball(folder: Path, rows: int) -> Path:
+    """A bumpy ball of 100 mm: each pole is as many vertices at one position as there are meridians."""
+    polar, azimuth = np.meshgrid(
+        np.linspace(0, np.pi, rows + 1), np.linspace(0, 2 * np.pi, rows, endpoint=False), indexing="ij"
+    )
+    radius_mm = 50 * (1 + 0.1 * np.sin(5 * azimuth) * np.sin(4 * polar))
+    direction = (np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar))
+    points = (radius_mm * np.stack(direction)).reshape(3, -1).T
+    row, column = np.meshgrid(np.arange(rows), np.arange(rows), indexing="ij")
+    a, b = (row * rows + column).reshape(-1), (row * rows + (column + 1) % rows).reshape(-1)
+    faces = np.concatenate([np.stack([a, a + rows, b], axis=-1), np.stack([b, a + rows, b + rows], axis=-1)])
+    file = folder / f"ball{rows}.ply"
+    trimesh.Trimesh(points, faces, process=False).export(file)
     return file
 
 

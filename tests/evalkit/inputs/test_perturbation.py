@@ -109,6 +109,8 @@ def test_a_start_behind_the_camera_names_the_parameter_and_the_command_its_optio
     assert behind.exit_code == 2
     assert behind.stderr.startswith("Error: --depth-stretch 20: puts object")
     assert behind.stderr.endswith("behind the camera; lower it or --random-translation\n")
+    named = perturb("--dataset", tmp_path / "depth_stretch", "--out", out, *options)
+    assert str(tmp_path / "depth_stretch") in named.stderr
 
 
 def test_an_unknown_protocol_is_refused():

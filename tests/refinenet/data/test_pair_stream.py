@@ -3,6 +3,7 @@ import json
 import shutil
 
 import numpy as np
+import psutil
 import pytest
 import torch
 from posecore.bop.models_info import ModelInfo, save_models_info
@@ -99,9 +100,15 @@ def test_ranks_and_workers_take_disjoint_shards(dataset, training):
 
 
 @pytest.mark.slow
-def test_loader_processes_give_the_plan_and_resume(dataset, training):
+def test_loader_processes_give_the_plan_and_resume(dataset, training, monkeypatch):
     overrides = ["loader.workers=2", "loader.prefetch=2"]
-    loaded = take(make_loader(make_stream(dataset, training, overrides, workers=2)), 6)
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    batches = iter(make_loader(make_stream(dataset, training, overrides, workers=2)))
+    loaded = [next(batches)]
+    started = psutil.Process().children()  # a second thread of OpenBLAS would wait in a busy loop
+    assert [p.environ()["OPENBLAS_NUM_THREADS"] for p in started if "spawn_main" in " ".join(p.cmdline())] == ["1", "1"]
+    loaded += itertools.islice(batches, 5)
+    del batches
     alone = [
         batch
         for pair in zip(*(

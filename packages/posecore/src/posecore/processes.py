@@ -19,7 +19,6 @@ from posecore.errors import RenderError
 
 T, R = TypeVar("T"), TypeVar("R")
 _PR_SET_PDEATHSIG = 1
-
 _MATH_THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 

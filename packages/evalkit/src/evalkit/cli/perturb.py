@@ -88,8 +88,8 @@ def perturb(
 
 
 def _with_options(message: str) -> str:
-    """An error of `perturb_dataset` with options for its parameters."""
-    options = {"depth_stretch": "--depth-stretch", "random_up_to.translation_diameter": "--random-translation"}
-    for parameter, option in options.items():
-        message = message.replace(parameter, option)
-    return message
+    """An error of `perturb_dataset` about its parameters, with options for them; one that names a file as it is."""
+    if not message.startswith("depth_stretch "):
+        return message
+    message = message.replace("depth_stretch", "--depth-stretch", 1)
+    return message.replace("random_up_to.translation_diameter", "--random-translation")

@@ -9,7 +9,6 @@ CREASE_DEG = 30.0
 """Faces that meet at a larger angle keep a hard edge between them; Blender's default."""
 _ROUNDING = 2 * float(np.finfo(np.float32).eps)
 """Height, over the largest coordinate, of a needle whose corners lie on a line up to the rounding of float32 files."""
-
 _NEEDLES = 4
 """Needles in a row, each at the longest edge of the one before, at least, that are followed to a face."""
 

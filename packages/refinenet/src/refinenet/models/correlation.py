@@ -140,7 +140,7 @@ class GradientCorrelation(nn.Module):
 
 
 def has_loop(values: Tensor) -> bool:
-    """Whether a compiled loop computes this: on a processor, without a gradient, and in no exported network."""
+    """Whether a compiled loop computes this: on a processor, no gradient, no export and no `torch.compile`."""
     is_plain = values.device.type == "cpu" and values.dtype == torch.float32 and not values.requires_grad
     return is_plain and not torch.compiler.is_compiling()
 
@@ -155,6 +155,7 @@ def _around(planes: Float[Tensor, "b c m m"]) -> Float[Tensor, "b c m m"]:
 def _cells(
     loop: Callable[..., None], values: Float[Tensor, "b c p p"], half_strength: float
 ) -> Float[Tensor, "b 2 n n"]:
+    """Cells of two pixels by one of the loops of `refinenet.models.kernels`."""
     b, _, p, q = values.shape
     result = values.new_empty((b, 2, p // 2, q // 2))
     loop(values.contiguous().numpy(), np.float32(half_strength**2), result.numpy())

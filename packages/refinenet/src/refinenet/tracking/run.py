@@ -172,7 +172,8 @@ def track_to_file(
     loaded = None if job.method.checkpoint is None else checkpoints.load(job.method.checkpoint)
     if job.dataset is not None:
         sequence: FrameSequence = open_scene(job.dataset, split=job.split, scene=job.scene, camera=job.camera)
-    elif job.source is not None:
+    else:
+        assert job.source is not None  # `TrackJob` requires one of both
         sequence = open_images(job.source, split=job.split, scene=job.scene, camera=job.camera)
     initial_poses = InitialPoses(sequence, job.init, job.pose, job.objects)
     meshes, infos = load_models(sequence, job.mesh_files, job.units, loaded, initial_poses.obj_ids)
